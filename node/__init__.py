@@ -1,0 +1,1 @@
+"""The daemon beside the scanner: capture, assemble, keep, plan, serve."""

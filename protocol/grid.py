@@ -1,0 +1,119 @@
+"""A scan as regular grids round the turntable's axis: its geometry, its samples, its void rule.
+
+Range is the distance from the axis. In memory that leaves the process and on every wire it is whole steps in uint16,
+0 where nothing was measured; as millimetres it is float32 with NaN there. Row 0 is the top. Column c stands at angle
+`theta0 + 2 pi (c + 0.5) / W`, counter-clockwise seen from above, and is cyclic; row r at `z_max - (r + 0.5) * pitch`.
+The texture shares that frame at its own resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+VOID = 0
+STEPS_MAX = 65535
+WIDTH_MAX = 16384
+HEIGHT_MAX = 16384
+RANGE_BLOCK = 8
+TEXTURE_BLOCK = 16
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+StepArray = NDArray[np.uint16]
+ImageArray = NDArray[np.uint8]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class GridSpec:
+    """Geometry of a scan, without its samples.
+
+    width, height : range columns W and rows H.       texture_width, texture_height : texels Wt and Ht.
+    step_mm : range of one step.                      pitch_mm : height of one range row.
+    z_max_mm : height of the top edge of row 0.       theta0_rad : angle of the left edge of column 0.
+    Raises ValueError when a shape or a length is out of bounds.
+    """
+
+    width: int
+    height: int
+    texture_width: int
+    texture_height: int
+    step_mm: float
+    pitch_mm: float
+    z_max_mm: float = 0.0
+    theta0_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "texture_width"):
+            _check_between(name, getattr(self, name), 1, WIDTH_MAX)
+        for name in ("height", "texture_height"):
+            _check_between(name, getattr(self, name), 1, HEIGHT_MAX)
+        for name in ("step_mm", "pitch_mm"):
+            _check_between(name, getattr(self, name), 1e-6, 1e3)
+        for name in ("z_max_mm", "theta0_rad"):
+            _check_between(name, getattr(self, name), -1e6, 1e6)
+
+    def angle_rad(self, column: FloatArray | IntArray) -> FloatArray:
+        """Angle of range columns (any shape). [rad, counter-clockwise from above]"""
+        return self.theta0_rad + 2 * np.pi * (np.asarray(column, np.float64) + 0.5) / self.width
+
+    def height_mm(self, row: FloatArray | IntArray) -> FloatArray:
+        """Height of range rows (any shape). [mm, row 0 at the top]"""
+        return self.z_max_mm - (np.asarray(row, np.float64) + 0.5) * self.pitch_mm
+
+    def cell_at(self, u: float, v: float) -> tuple[int, int]:
+        """Range cell (row, column) under a click (u, v) in [0, 1); ValueError outside."""
+        for name, value in (("u", u), ("v", v)):
+            if not (math.isfinite(value) and 0 <= value < 1):
+                raise ValueError(f"{name} must be in [0, 1), got {value}")
+        return int(v * self.height), int(u * self.width)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """A scan's samples: range_steps (H, W) uint16, 0 = void; texture (Ht, Wt, 3) uint8 RGB."""
+
+    spec: GridSpec
+    range_steps: StepArray
+    texture: ImageArray
+
+    def __post_init__(self) -> None:
+        s = self.spec
+        if self.range_steps.shape != (s.height, s.width) or self.range_steps.dtype != np.uint16:
+            raise ValueError(f"range_steps must be ({s.height}, {s.width}) uint16")
+        if self.texture.shape != (s.texture_height, s.texture_width, 3) or self.texture.dtype != np.uint8:
+            raise ValueError(f"texture must be ({s.texture_height}, {s.texture_width}, 3) uint8")
+
+    @property
+    def range_mm(self) -> NDArray[np.float32]:
+        """Distance from the axis. (H, W) float32 [mm], NaN where void."""
+        return steps_to_mm(self.range_steps, self.spec.step_mm)
+
+
+def steps_to_mm(range_steps: StepArray, step_mm: float) -> NDArray[np.float32]:
+    """Whole steps to millimetres, same shape, float32; void (0) becomes NaN."""
+    range_mm = range_steps.astype(np.float32) * np.float32(step_mm)
+    range_mm[range_steps == VOID] = np.nan
+    return range_mm
+
+
+def mm_to_steps(range_mm: NDArray[np.floating], step_mm: float) -> StepArray:
+    """Millimetres to whole steps, same shape, uint16; NaN becomes void (0).
+
+    Raises ValueError where a measured range does not fit 1..65535 steps: nothing is clamped.
+    """
+    measured = ~np.isnan(range_mm)
+    steps = np.rint(np.where(measured, range_mm, step_mm) / step_mm)
+    if steps.size and not (1 <= steps.min() and steps.max() <= STEPS_MAX):
+        raise ValueError(f"range outside 1..{STEPS_MAX} steps of {step_mm} mm")
+    return np.where(measured, steps, VOID).astype(np.uint16)
+
+
+def _check_between(name: str, value: float, low: float, high: float) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        raise ValueError(f"{name} must be between {low} and {high}, got {value}")
