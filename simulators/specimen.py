@@ -1,0 +1,90 @@
+"""What stands on the simulated turntable: a grid whose every sample is known.
+
+The turntable asks for the column at any angle. At a column's own angle the answer is that column, bit for bit; in
+between it is interpolated, so a jittering encoder sees the object where the table really stood.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from protocol.errors import ConfigError
+from protocol.grid import VOID, Grid, ImageArray, StepArray
+from simulators import shapes
+
+SIZES: Mapping[str, shapes.Shape] = MappingProxyType(
+    {
+        "S": (360, 100, 1024, 256),
+        "M": (1440, 1024, 4096, 2048),
+        "L": (4096, 2048, 8192, 4096),
+    }
+)
+GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType(
+    {
+        "sphere": shapes.sphere,
+        "cylinder": shapes.cylinder,
+    }
+)
+ON_COLUMN = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Specimen:
+    """An object with known truth. Its arrays are made read-only: nobody can change the truth while it is scanned."""
+
+    name: str
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        self.grid.range_steps.flags.writeable = False
+        self.grid.texture.flags.writeable = False
+
+    def range_column(self, angle_rad: float) -> StepArray:
+        """Range seen at an angle. (H,) uint16 steps, 0 = void
+
+        Between two measured samples the range is interpolated; where either is void the nearer one decides.
+        """
+        spec, steps = self.grid.spec, self.grid.range_steps
+        left, right, weight = _columns_about(angle_rad, spec.theta0_rad, spec.width)
+        before, after = steps[:, left], steps[:, right]
+        nearer = after if weight > 0.5 else before
+        mixed = np.rint(before + weight * (after.astype(np.float64) - before))
+        return np.where((before != VOID) & (after != VOID), mixed, nearer).astype(np.uint16)
+
+    def texture_column(self, angle_rad: float) -> ImageArray:
+        """Colour seen at an angle, interpolated. (Ht, 3) uint8 RGB"""
+        spec, texture = self.grid.spec, self.grid.texture
+        left, right, weight = _columns_about(angle_rad, spec.theta0_rad, spec.texture_width)
+        before, after = texture[:, left], texture[:, right]
+        return np.rint(before + weight * (after.astype(np.float64) - before)).astype(np.uint8)
+
+
+def make_specimen(
+    name_or_path: str | Path, size: str = "S", texture_path: str | Path | None = None, seed: int = 0
+) -> Specimen:
+    """A generated specimen by name.
+
+    size : S, M or L.
+    Raises ConfigError for an unknown name or size.
+    """
+    generate = GENERATORS.get(str(name_or_path))
+    if generate is None:
+        raise ConfigError(f"specimen: {name_or_path} is none of {', '.join(GENERATORS)}")
+    if size not in SIZES:
+        raise ConfigError(f"size: {size} is none of {', '.join(SIZES)}")
+    return Specimen(str(name_or_path), generate(SIZES[size], seed))
+
+
+def _columns_about(angle_rad: float, theta0_rad: float, width: int) -> tuple[int, int, float]:
+    """The columns before and after an angle, and the weight in [0, 1) of the one after."""
+    position = (angle_rad - theta0_rad) * width / (2 * math.pi) - 0.5
+    whole = round(position)
+    # Angles are rounded floats: a nominal angle must not become a blend of two columns.
+    column, weight = (whole, 0.0) if abs(position - whole) < ON_COLUMN else (math.floor(position), position % 1)
+    return column % width, (column + 1) % width, weight
