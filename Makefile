@@ -1,0 +1,55 @@
+# The verbs of this project. The first `make` builds .venv from the hashed lock; later ones find their stamps and start at once.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+RUN := $(BIN)/python -m
+PIP := $(RUN) pip --disable-pip-version-check -q
+
+.DELETE_ON_ERROR:
+.PHONY: install demo test lint bench lock clean
+
+install: $(VENV)/.app
+
+demo: install
+	$(BIN)/foveascan demo $(ARGS)
+
+test: install
+	$(RUN) pytest -q -n auto --dist loadfile $(ARGS)
+
+lint: install
+	$(BIN)/ruff check .
+	$(RUN) mypy
+	$(BIN)/lint-imports
+
+bench: install
+	$(BIN)/foveascan bench $(ARGS)
+
+# Resolves pyproject.toml and requirements.in anew. Commit what it writes.
+lock: $(VENV)/.pip
+	$(PIP) install uv
+	$(RUN) uv -q pip compile --upgrade --universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-annotate --no-header \
+		--no-emit-index-url --no-emit-find-links --extra dev pyproject.toml requirements.in -o constraints.txt > /dev/null
+
+clean:
+	rm -rf $(VENV) dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/.pip:
+	@command -v $(PYTHON) > /dev/null || { echo "foveascan: no $(PYTHON) here; name a Python of 3.11 or newer: make PYTHON=/path/to/python3" >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	{ echo "foveascan: $$($(PYTHON) -V 2>&1) is too old, 3.11 or newer is needed: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2> /dev/null || \
+	{ echo "foveascan: $(PYTHON) cannot make a virtual environment; as root: apt-get install python3-venv" >&2; exit 2; }
+	@rm -rf $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.deps: constraints.txt $(VENV)/.pip
+	@echo "foveascan: installing the locked packages into $(VENV), about a minute the first time"
+	@$(PIP) install --require-hashes -r constraints.txt
+	@touch $@
+
+$(VENV)/.app: pyproject.toml $(VENV)/.deps
+	@$(PIP) install --no-deps --no-build-isolation -e .
+	@touch $@
