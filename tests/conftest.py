@@ -1,4 +1,4 @@
-"""What every test shares: hypothesis without a stopwatch, for two busy cores would make slow examples look like failures.
+"""What every test shares: hypothesis without a stopwatch, since two busy cores make slow examples look like failures.
 
 In CI (the variable CI is set) hypothesis loads its own profile: the same examples every time, and no stopwatch either.
 """

@@ -1,0 +1,177 @@
+"""The node's settings: one TOML file, a section for each part, a default, a unit and bounds beside each setting.
+
+A wrong type, an unknown key or a value out of bounds is a ConfigError that names its place ("capture.baud: ...");
+nothing is repaired. Each part of the node is handed its own section and sees no other. Bounds are checked where
+settings come in, in `load_config`; sections are frozen from then on.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
+
+from protocol.errors import ConfigError
+
+FILE_MAX_BYTES = 65536
+DNS_LABEL_MAX_BYTES = 63
+
+
+def _split_listen(listen: str) -> tuple[str, int]:
+    match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})", listen)
+    if not match or int(match[3]) > 65535:
+        raise ValueError(f"listen: expected HOST:PORT or [IPv6]:PORT, got {listen!r}")
+    return match[1] or match[2], int(match[3])
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class Capture(Struct, frozen=True, forbid_unknown_fields=True):
+    """[capture]: the scanner's port."""
+
+    scanner: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # device path; none: library only
+    baud: Annotated[int, Meta(ge=9600, le=12_000_000)] = 3_000_000  # [Bd]; a USB CDC device ignores it
+    stale_s: Annotated[float, Meta(ge=0.1, le=60)] = 2.0  # a link quiet for so long is stale
+
+
+class Server(Struct, frozen=True, forbid_unknown_fields=True):
+    """[server]: who may connect, and how much of the node one of them may use."""
+
+    listen: Annotated[str, Meta(max_length=300)] = "127.0.0.1:7345"  # HOST:PORT or [IPv6]:PORT; port 0: any free one
+    insecure: bool = False  # plain HTTP without login, on loopback only
+    max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
+    client_queue: Annotated[int, Meta(ge=1, le=256)] = 8  # messages waiting for one client
+    encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode
+
+    def __post_init__(self) -> None:
+        host, _ = _split_listen(self.listen)
+        if self.insecure and not _is_loopback(host):
+            raise ValueError(f"insecure: without login only loopback is served, not {host}; listen on 127.0.0.1")
+
+    @property
+    def host(self) -> str:
+        """The address to bind, without brackets."""
+        return _split_listen(self.listen)[0]
+
+    @property
+    def port(self) -> int:
+        """The TCP port to bind; 0 takes any free one."""
+        return _split_listen(self.listen)[1]
+
+
+class Library(Struct, frozen=True, forbid_unknown_fields=True):
+    """[library]: where scans are kept."""
+
+    folder: Annotated[str, Meta(min_length=1, max_length=4096)] = "~/.local/share/foveascan"  # ~ is the service's home
+
+    @property
+    def path(self) -> Path:
+        """The folder, with ~ expanded. Raises ConfigError where nobody's home is known."""
+        try:
+            return Path(self.folder).expanduser()
+        except RuntimeError as problem:
+            raise ConfigError(f"library.folder: {problem}; write an absolute path") from problem
+
+
+class FirstView(Struct, frozen=True, forbid_unknown_fields=True):
+    """[first_view]: the whole object at once, coarsely."""
+
+    max_bytes: Annotated[int, Meta(ge=1024, le=1 << 20)] = 32768  # coarse grid, coarse texture and headers together
+
+
+class Planner(Struct, frozen=True, forbid_unknown_fields=True):
+    """[planner]: what an update aims at where the client names nothing."""
+
+    window: Annotated[float, Meta(gt=0, le=1)] = 0.05  # share of the area round the click
+    texture_db: Annotated[float, Meta(ge=10, le=80)] = 40.0  # PSNR to reach in the window
+    range_mm: Annotated[float, Meta(ge=1e-4, le=100)] = 0.1  # 99th percentile of the range error to reach in the window
+    cold_start_bytes_s: Annotated[float, Meta(ge=1e3, le=1e9)] = 1e6  # bandwidth assumed until acknowledgements tell
+
+
+class Discovery(Struct, frozen=True, forbid_unknown_fields=True):
+    """[discovery]: the announcement on the LAN."""
+
+    enabled: bool = True
+    name: Annotated[str, Meta(min_length=1)] | None = None  # instance name, at most 63 bytes of UTF-8; none: the host's
+
+    def __post_init__(self) -> None:
+        size_bytes = len((self.name or "").encode())
+        if size_bytes > DNS_LABEL_MAX_BYTES:
+            raise ValueError(f"name: expected at most {DNS_LABEL_MAX_BYTES} bytes of UTF-8, got {size_bytes}")
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True):
+    """All sections; each part of the node is handed its own."""
+
+    capture: Capture = Capture()
+    server: Server = Server()
+    library: Library = Library()
+    first_view: FirstView = FirstView()
+    planner: Planner = Planner()
+    discovery: Discovery = Discovery()
+
+
+def load_config(path: Path | None = None, overrides: Mapping[str, object] | None = None) -> Config:
+    """Settings from a TOML file (none: the defaults), then from `overrides`, which win.
+
+    overrides : {"server.listen": "127.0.0.1:0", ...}, as a command line gives them; None there means "not given".
+    Raises ConfigError for a file that cannot be read or is no TOML, and for a setting that is unknown or out of bounds.
+    """
+    settings = _read_toml(path) if path else {}
+    for place, value in (overrides or {}).items():
+        if value is not None:
+            _set(settings, place, value)
+    try:
+        return msgspec.convert(settings, Config)
+    except msgspec.ValidationError as problem:
+        raise ConfigError(_in_our_words(str(problem))) from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            data = file.read(FILE_MAX_BYTES + 1)
+    except OSError as problem:
+        raise ConfigError(f"{path}: {problem.strerror}") from problem
+    if len(data) > FILE_MAX_BYTES:
+        raise ConfigError(f"{path}: longer than {FILE_MAX_BYTES} bytes, so not a configuration of this node")
+    try:
+        return tomllib.loads(data.decode())
+    except (ValueError, RecursionError) as problem:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
+        raise ConfigError(f"{path}: not TOML: {problem}") from problem
+
+
+def _set(settings: dict[str, Any], place: str, value: object) -> None:
+    section, _, key = place.partition(".")
+    table = settings.setdefault(section, {})
+    if isinstance(table, dict):  # else the file is wrong here, and the conversion says so
+        table[key] = value
+
+
+def _in_our_words(problem: str) -> str:
+    """A message of msgspec, place first: "Expected `int` <= 9 - at `$.a.b`" becomes "a.b: expected int <= 9"."""
+    what, _, at = problem.partition(" - at ")
+    where = at.strip("`").removeprefix("$").removeprefix(".")
+    if unknown := re.fullmatch("Object contains unknown field `(.*)`", what, re.DOTALL):
+        place = ".".join(filter(None, (where, unknown[1])))
+        return f"{place}: unknown key; known here: {', '.join(_keys_of(where))}"
+    if not what.startswith("Expected"):  # from a __post_init__ above, which names its own key
+        return f"{where}.{what}"
+    return f"{where}: {what.replace('`object`', 'a table').replace('`', '').replace('Expected', 'expected')}"
+
+
+def _keys_of(section: str) -> tuple[str, ...]:
+    owner = getattr(Config(), section) if section else Config()
+    keys: tuple[str, ...] = owner.__struct_fields__
+    return keys
