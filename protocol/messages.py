@@ -1,0 +1,280 @@
+"""Control messages on the LAN: JSON text, one object each, `type` first. Refinements travel beside them as binary.
+
+Field names are camelCase on the wire. Unknown fields are ignored (a newer minor version may add some); unknown types,
+missing fields and values out of bounds are refused. Transcript and table: PROTOCOL.md, "Stream".
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from protocol.errors import LocalWireError, RemoteWireError
+from protocol.grid import HEIGHT_MAX, WIDTH_MAX, GridSpec
+from protocol.lattice import Channel, ChannelShape, channel_shapes
+
+PROTOCOL = "foveascan.v1"
+TEXT_MAX = 4 << 20
+RUNS_MAX = 300_000
+
+Unit = Annotated[float, Meta(ge=0, lt=1)]
+Share = Annotated[float, Meta(gt=0, le=1)]
+Seconds = Annotated[float, Meta(ge=0.05, le=30)]
+ByteCount = Annotated[int, Meta(ge=0, le=1 << 40)]
+Count = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+Epoch = Annotated[int, Meta(ge=0, le=0xFFFF)]
+ShortText = Annotated[str, Meta(max_length=200)]
+Digest = Annotated[str, Meta(pattern="^[0-9a-f]{16}$")]
+Run = Annotated[list[int], Meta(min_length=3, max_length=3)]
+Runs = Annotated[list[Run], Meta(max_length=RUNS_MAX)]
+Columns = Annotated[int, Meta(ge=1, le=WIDTH_MAX)]
+Rows = Annotated[int, Meta(ge=1, le=HEIGHT_MAX)]
+CodecName = Literal["jpeg", "htj2k"]
+
+
+class _Part(msgspec.Struct, frozen=True, rename="camel", omit_defaults=True):
+    """A record inside a message."""
+
+
+class _Message(_Part, frozen=True, tag_field="type", tag=lambda name: name[0].lower() + name[1:]):
+    """Base of all messages."""
+
+
+class ScanInfo(_Part, frozen=True):
+    """What a client must know of a scan before its first view. Lengths in mm, angle in rad."""
+
+    id: ShortText
+    width: Columns
+    height: Rows
+    texture_width: Columns
+    texture_height: Rows
+    coarse_width: Columns
+    coarse_height: Rows
+    coarse_texture_width: Columns
+    coarse_texture_height: Rows
+    step_mm: float
+    pitch_mm: float
+    z_max_mm: float
+    theta0_rad: float
+    created: ShortText = ""
+    geometry: Literal["cylinder"] = "cylinder"
+
+    def spec(self) -> GridSpec:
+        """Geometry of the scan. Raises RemoteWireError when it makes no sense."""
+        try:
+            return GridSpec(
+                self.width, self.height, self.texture_width, self.texture_height,
+                self.step_mm, self.pitch_mm, self.z_max_mm, self.theta0_rad,
+            )  # fmt: skip
+        except ValueError as error:
+            raise RemoteWireError(f"scan {self.id}: {error}") from None
+
+    def shapes(self) -> dict[Channel, ChannelShape]:
+        """Shapes of both channels. Raises RemoteWireError when they make no sense."""
+        coarse_range = self.coarse_height, self.coarse_width
+        try:
+            return channel_shapes(self.spec(), coarse_range, (self.coarse_texture_height, self.coarse_texture_width))
+        except ValueError as error:
+            raise RemoteWireError(f"scan {self.id}: {error}") from None
+
+
+class RangeParameters(_Part, frozen=True):
+    """Range sampling: p plateau spacing, quantum in steps of the scan, s the skirt's S' (null: no skirt)."""
+
+    p: Literal[1, 2, 4, 8] = 1
+    quantum: Annotated[int, Meta(ge=1, le=65534)] = 1
+    s: Annotated[float, Meta(ge=0.1, le=1000)] | None = 1.0
+
+
+class TextureParameters(_Part, frozen=True):
+    """Texture sampling: p plateau spacing, quality 0..255 (255 lossless), its codec, s the skirt's S'."""
+
+    p: float = 1
+    quality: Annotated[int, Meta(ge=0, le=255)] = 60
+    codec: CodecName = "htj2k"
+    s: Annotated[float, Meta(ge=0.1, le=1000)] | None = 1.0
+
+
+class LookParameters(_Part, frozen=True):
+    """Explicit parameters of a look; a channel left out is not refined."""
+
+    range: RangeParameters | None = None
+    texture: TextureParameters | None = None
+
+
+class Sent(_Part, frozen=True):
+    """What one refinement of an update was: the lattice that travelled, in words."""
+
+    channel: Literal["range", "texture"]
+    p: float
+    quality: int
+    codec: ShortText
+    plateau: Annotated[list[int], Meta(min_length=4, max_length=4)]
+    rho: Annotated[list[int], Meta(min_length=2, max_length=2)]
+    samples: Count
+    payload_bytes: ByteCount
+
+
+# From the node
+
+
+class ServerInfo(_Message, frozen=True):
+    """First message of a stream: who speaks, which version, and whether a token is needed."""
+
+    protocol: ShortText
+    id: ShortText
+    name: ShortText
+    version: ShortText
+    login: bool = False
+
+
+class Welcome(_Message, frozen=True):
+    """The client is let in."""
+
+    role: Literal["view", "operate", "admin"]
+
+
+class Opened(_Message, frozen=True):
+    """A scan is bound to this stream; its first view follows as two refinements."""
+
+    request: Count
+    epoch: Epoch
+    scan: ScanInfo
+
+
+class Updated(_Message, frozen=True):
+    """All refinements of a look are sent: why it ended, what was used, what is left."""
+
+    request: Count
+    reason: Literal["complete", "byte limit", "superseded"]
+    next_seq: Count
+    byte_count: ByteCount
+    sent: list[Sent]
+    error_max_mm: float | None = None
+    texture_db: float | None = None
+    encodes: int = 0
+    node_ms: float = 0.0
+
+
+class Resync(_Message, frozen=True):
+    """The ends disagree: the client must state its holdings."""
+
+    epoch: Epoch
+    reason: ShortText
+
+
+class Published(_Message, frozen=True):
+    """A new scan is in the library."""
+
+    scan: ShortText
+
+
+class Refused(_Message, frozen=True):
+    """A request failed; the stream goes on. request 0: none in particular."""
+
+    request: Count
+    code: Literal["bad request", "not found", "not open", "forbidden", "busy", "internal"]
+    message: Annotated[str, Meta(max_length=500)]
+
+
+class Goodbye(_Message, frozen=True):
+    """The node ends the stream."""
+
+    reason: ShortText
+
+
+# From the client
+
+
+class Hello(_Message, frozen=True):
+    """The client presents itself. codecs: texture codecs it decodes, the one it likes best first."""
+
+    protocol: ShortText
+    client: ShortText = ""
+    token: ShortText = ""
+    codecs: Annotated[list[CodecName], Meta(min_length=1, max_length=8)] = ["htj2k", "jpeg"]  # noqa: RUF012
+
+
+class Statement(_Part, frozen=True):
+    """Holdings in run lengths: [count, level, rank] over the blocks in row order."""
+
+    range: Runs
+    texture: Runs
+
+
+class Open(_Message, frozen=True):
+    """Bind a scan ("latest" or an id). With holdings, no first view is sent: go on from there."""
+
+    request: Count
+    scan: ShortText
+    holdings: Statement | None = None
+
+
+class Look(_Message, frozen=True):
+    """Refine round a click, until the quality is reached or the budget is spent. Newer looks supersede older ones.
+
+    window : share of the area.  texture_db, range_mm : quality to stop at.  fill : spend what is left on the periphery.
+    """
+
+    request: Count
+    u: Unit
+    v: Unit
+    window: Share = 0.05
+    texture_db: Annotated[float, Meta(ge=10, le=100)] = 40.0
+    range_mm: Annotated[float, Meta(ge=0, le=1000)] = 0.1
+    max_wait_s: Seconds | None = None
+    max_bytes: ByteCount | None = None
+    fill: bool = False
+    profile: Literal["default"] = "default"
+    parameters: LookParameters | None = None
+
+
+class Ack(_Message, frozen=True):
+    """Every refinement before next_seq is applied; digest of what the client then holds."""
+
+    epoch: Epoch
+    next_seq: Count
+    digest: Digest
+    apply_ms: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+
+
+class State(_Message, frozen=True):
+    """What the client holds, in answer to Resync."""
+
+    epoch: Epoch
+    next_seq: Count
+    holdings: Statement
+
+
+class Cancel(_Message, frozen=True):
+    """Forget a look that is not answered yet."""
+
+    request: Count
+
+
+FromNode = ServerInfo | Welcome | Opened | Updated | Resync | Published | Refused | Goodbye
+FromClient = Hello | Open | Look | Ack | State | Cancel
+Message = FromNode | FromClient
+
+_encoder = msgspec.json.Encoder()
+_decoder = msgspec.json.Decoder(Message)
+
+
+def encode_message(message: Message) -> str:
+    """JSON text. Raises LocalWireError when it is too long."""
+    text = _encoder.encode(message)
+    if len(text) > TEXT_MAX:
+        raise LocalWireError(f"message of {len(text)} bytes is longer than {TEXT_MAX}")
+    return text.decode()
+
+
+def decode_message(text: str | bytes) -> Message:
+    """Inverse of encode_message. Raises RemoteWireError naming what is wrong with it."""
+    if len(text) > TEXT_MAX:
+        raise RemoteWireError(f"message of {len(text)} bytes is longer than {TEXT_MAX}")
+    try:
+        return _decoder.decode(text)
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+        raise RemoteWireError(f"bad message: {error}") from None

@@ -1,0 +1,262 @@
+"""From what travelled to the dense model: which samples a refinement carries, and the cells it fills with them.
+
+Range is interpolated in integers, so that every client gets the same grid; texture in float32, where a level of
+difference does no harm. Adopted blocks are overwritten whole; nothing else changes.
+
+Source: REQUIREMENTS F-08, F-09c, F-11.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from protocol.errors import LatticeError
+from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, ImageArray, IntArray, StepArray
+from protocol.holdings import ChannelHoldings, HashArray, hash_blocks
+from protocol.lattice import QUARTERS, Axis, ChannelShape, Lattice
+
+BAND_ROWS = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """One axis of a selection: the run of covered blocks round the adopted ones, and the samples they need.
+
+    block : (b,) int64 block indices.   size : (b,) int64 dense samples in each.   start : first dense position, not wrapped.
+    sample : (n,) int64 the lattice's samples that travel, ascending.
+    low, high : (cells,) int64 for each dense position, the two transmitted samples beside it ...
+    part, whole : (cells,) int64 ... and its place between them, part / whole.
+    """
+
+    block: IntArray
+    size: IntArray
+    start: int
+    sample: IntArray
+    low: IntArray
+    high: IntArray
+    part: IntArray
+    whole: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """What one refinement of a lattice carries. The payload is an image: y.sample by x.sample.
+
+    adopted : (by, bx) bool over the windows' blocks; the first and last row and column each hold an adopted block.
+    """
+
+    lattice: Lattice
+    y: Window
+    x: Window
+    adopted: BoolArray
+
+    @property
+    def sample_shape(self) -> tuple[int, int]:
+        """Rows and columns of the payload."""
+        return self.y.sample.size, self.x.sample.size
+
+    @property
+    def samples(self) -> int:
+        """Number of values in the payload."""
+        return self.y.sample.size * self.x.sample.size
+
+    def adopted_cells(self) -> BoolArray:
+        """Which cells of the windows' rectangle are adopted. (rows, columns) bool."""
+        return np.repeat(np.repeat(self.adopted, self.y.size, axis=0), self.x.size, axis=1)
+
+    def adopted_blocks(self) -> IntArray:
+        """Flat indices of the adopted blocks. (n,) int64, in the windows' row order."""
+        rows, columns = np.nonzero(self.adopted)
+        return self.y.block[rows] * self.lattice.shape.blocks[1] + self.x.block[columns]
+
+    def spans(self) -> Iterator[tuple[slice, slice, slice]]:
+        """Where the windows' rectangle lies: (dense rows, dense columns, columns of the rectangle), cut at the seam."""
+        width = self.lattice.shape.width
+        rows = slice(self.y.start, self.y.start + self.y.low.size)
+        done = 0
+        while done < self.x.low.size:
+            column = (self.x.start + done) % width
+            run = min(self.x.low.size - done, width - column)
+            yield rows, slice(column, column + run), slice(done, done + run)
+            done += run
+
+
+def select(lattice: Lattice, held: ChannelHoldings, rank: int) -> tuple[Selection, BoolArray] | None:
+    """What a refinement at `rank` would carry to a client that holds `held`, or None when nothing would be adopted.
+
+    Returns the selection and the adopted blocks over the whole lattice (for ChannelHoldings.adopt).
+    """
+    adopted = held.adoptable(lattice, rank)
+    rows, columns = np.flatnonzero(adopted.any(1)), np.flatnonzero(adopted.any(0))
+    if not rows.size:
+        return None
+    y = _window(lattice.y, int(rows[0]), int(rows[-1]) + 1)
+    x = _window(lattice.x, int(columns[0]), int(columns[-1]) + 1)
+    core = adopted[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return Selection(lattice, y, x, core), adopted
+
+
+def _window(axis: Axis, begin: int, end: int) -> Window:
+    begin_at, end_at = int(axis.first[begin]), int(axis.last[end - 1]) + 1
+    at = axis.at[begin_at:end_at]
+    sample, local = np.unique(axis.sample[begin_at:end_at], return_inverse=True)
+    start = int(axis.start[begin])
+    position = QUARTERS * np.arange(start, int(axis.stop[end - 1]), dtype=np.int64)
+    if at.size == 1:
+        zero = np.zeros(position.size, np.int64)
+        low, high, part, whole = zero, zero, zero, np.ones_like(zero)
+    else:
+        index = np.minimum(np.searchsorted(at, position, side="right") - 1, at.size - 2)
+        low, high = local[index], local[index + 1]
+        part, whole = position - at[index], at[index + 1] - at[index]
+    size = axis.stop[begin:end] - axis.start[begin:end]
+    return Window(axis.block[begin:end], size, start, sample, low, high, part, whole)
+
+
+def quantise(range_steps: StepArray, quantum: int) -> StepArray:
+    """Range to multiples of `quantum` steps: k = (z + quantum // 2) // quantum, same shape, uint16."""
+    return ((range_steps.astype(np.uint32) + np.uint32(quantum // 2)) // np.uint32(quantum)).astype(np.uint16)
+
+
+def dequantise(values: StepArray, quantum: int) -> StepArray:
+    """Inverse of quantise, to within quantum // 2 steps: clamp(k quantum, 1, 65535); never void."""
+    return np.clip(values.astype(np.uint32) * np.uint32(quantum), 1, STEPS_MAX).astype(np.uint16)
+
+
+def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
+    """Dense range of the windows' rectangle from the transmitted samples, by integer bilinear interpolation.
+
+    range_steps : sample_shape uint16, dequantised, without voids.  Returns (rows, columns) uint16.
+    A cell between samples z with integer weights w that add up to d is (2 sum(w z) + d) // (2 d). Every product stays
+    below 2^53, so float64 holds it exactly and its quotient's floor is the integer one.
+    """
+    y, x = selection.y, selection.x
+    _check_samples(selection, range_steps.shape)
+    columns = _blend(range_steps.T.astype(np.float64), x).T
+    return _round_ratio(_blend(columns, y), (y.whole[:, None] * x.whole[None, :]).astype(np.float64))
+
+
+def _blend(samples: FloatArray, window: Window) -> FloatArray:
+    """Weighted sums along axis 0, not yet divided: low (whole - part) + high part."""
+    part = window.part[:, None].astype(np.float64)
+    whole = window.whole[:, None].astype(np.float64)
+    return samples[window.low] * (whole - part) + samples[window.high] * part
+
+
+def _round_ratio(numerator: FloatArray, denominator: FloatArray) -> StepArray:
+    return np.floor((2 * numerator + denominator) / (2 * denominator)).astype(np.uint16)
+
+
+def texture_patch(selection: Selection, texels: ImageArray) -> ImageArray:
+    """Dense texture of the windows' rectangle from the transmitted texels, bilinear, rounded half up.
+
+    texels : sample_shape + (3,) uint8.  Returns (rows, columns, 3) uint8. Works in bands, so memory stays bounded.
+    """
+    y, x = selection.y, selection.x
+    _check_samples(selection, texels.shape[:2])
+    patch = np.empty((y.low.size, x.low.size, 3), np.uint8)
+    part_x = (x.part / x.whole).astype(np.float32)[None, :, None]
+    part_y = (y.part / y.whole).astype(np.float32)[:, None, None]
+    for top in range(0, y.low.size, BAND_ROWS):
+        band = slice(top, top + BAND_ROWS)
+        rows = _lerp(texels[y.low[band]], texels[y.high[band]], part_y[band])
+        patch[band] = _lerp(rows[:, x.low], rows[:, x.high], part_x) + np.float32(0.5)
+    return patch
+
+
+def _lerp(low: ImageArray, high: ImageArray, part: FloatArray) -> FloatArray:
+    if not part.any():
+        return low.astype(np.float32)
+    return low + (high.astype(np.float32) - low) * part
+
+
+def paste(dense: StepArray | ImageArray, patch: StepArray | ImageArray, selection: Selection) -> None:
+    """Overwrite the adopted blocks of a dense array with a patch; every other cell stays as it is."""
+    where = selection.adopted_cells()
+    whole = bool(selection.adopted.all())
+    for rows, columns, source in selection.spans():
+        if whole:
+            dense[rows, columns] = patch[:, source]
+        else:
+            dense[rows, columns][where[:, source]] = patch[:, source][where[:, source]]
+
+
+def cut(dense: StepArray | ImageArray, selection: Selection) -> StepArray | ImageArray:
+    """The windows' rectangle of a dense array, the seam joined. (rows, columns, ...) copy."""
+    return np.concatenate([dense[rows, columns] for rows, columns, _ in selection.spans()], axis=1)
+
+
+def content_hashes(patch: StepArray, selection: Selection) -> HashArray:
+    """Hashes of the adopted blocks of a range patch, in the order of Selection.adopted_blocks. (n,) uint32."""
+    side = selection.lattice.shape.block
+    rows, columns = selection.adopted.shape
+    if patch.shape != (rows * side, columns * side):
+        padded = np.zeros((rows * side, columns * side), np.uint16)
+        padded[np.ix_(_padded_place(selection.y.size, side), _padded_place(selection.x.size, side))] = patch
+        patch = padded
+    cells = patch.reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
+    return hash_blocks(cells[selection.adopted])
+
+
+def _padded_place(size: IntArray, side: int) -> IntArray:
+    """Where each dense position goes when every block is padded to its full side."""
+    return np.concatenate([index * side + np.arange(n) for index, n in enumerate(size.tolist())])
+
+
+def coarse_to_range(coarse_steps: StepArray, shape: ChannelShape) -> StepArray:
+    """Dense range from the first view: bilinear between cell centres, voids left out. (H, W) uint16.
+
+    coarse_steps : (h, w) uint16, 0 = void. Position of dense column x in coarse units: ((2x + 1) w - W) / 2W, cyclic;
+    rows likewise, clamped. A cell is void iff the nearest coarse cell is; else (2 sum(w z) + d) // (2 d) over measured ones.
+    """
+    if coarse_steps.shape != (shape.coarse_height, shape.coarse_width):
+        raise LatticeError(f"first view must be {shape.coarse_height} x {shape.coarse_width} range samples")
+    x_low, x_high, x_part = _between_centres(shape.width, shape.coarse_width, cyclic=True)
+    y_low, y_high, y_part = _between_centres(shape.height, shape.coarse_height, cyclic=False)
+    dense = np.empty((shape.height, shape.width), np.uint16)
+    columns = np.where(2 * x_part < 2 * shape.width, x_low, x_high)
+    for top in range(0, shape.height, BAND_ROWS):
+        band = slice(top, top + BAND_ROWS)
+        total, weight = np.zeros((2, y_low[band].size, shape.width))
+        for y, y_weight in ((y_low, 2 * shape.height - y_part), (y_high, y_part)):
+            for x, x_weight in ((x_low, 2 * shape.width - x_part), (x_high, x_part)):
+                corner = coarse_steps[np.ix_(y[band], x)].astype(np.float64)
+                share = np.multiply.outer(y_weight[band], x_weight) * (corner != VOID)
+                total += share * corner
+                weight += share
+        rows = np.where(2 * y_part[band] < 2 * shape.height, y_low[band], y_high[band])
+        void = coarse_steps[np.ix_(rows, columns)] == VOID
+        dense[band] = np.where(void, VOID, _round_ratio(total, np.where(void, 1, weight)))
+    return dense
+
+
+def coarse_to_texture(coarse: ImageArray, shape: ChannelShape) -> ImageArray:
+    """Dense texture from the first view: bilinear between cell centres, cyclic in x. (Ht, Wt, 3) uint8."""
+    if coarse.shape != (shape.coarse_height, shape.coarse_width, 3):
+        raise LatticeError(f"first view must be {shape.coarse_height} x {shape.coarse_width} texels")
+    # Pad by whole cells that are whole texels too, so that cell centres stay where they are in the enlarged image.
+    pad = shape.coarse_width // math.gcd(shape.width, shape.coarse_width)
+    wide = np.concatenate([coarse[:, -pad:], coarse, coarse[:, :pad]], axis=1)
+    margin = pad * shape.width // shape.coarse_width
+    dense = cv2.resize(wide, (shape.width + 2 * margin, shape.height), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(dense[:, margin : margin + shape.width], np.uint8)
+
+
+def _between_centres(size: int, coarse: int, *, cyclic: bool) -> tuple[IntArray, IntArray, IntArray]:
+    """For each dense position the coarse cells beside it and its place between them, in units of 1 / (2 size)."""
+    position = (2 * np.arange(size, dtype=np.int64) + 1) * coarse - size
+    low = position // (2 * size)
+    part = position - low * (2 * size)
+    if cyclic:
+        return low % coarse, (low + 1) % coarse, part
+    return np.clip(low, 0, coarse - 1), np.clip(low + 1, 0, coarse - 1), part
+
+
+def _check_samples(selection: Selection, shape: tuple[int, ...]) -> None:
+    if shape != selection.sample_shape:
+        raise LatticeError(f"expected {selection.sample_shape} samples, got {shape}")

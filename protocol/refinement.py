@@ -1,0 +1,150 @@
+"""One refinement on the wire: a generator's name and parameters, and the values it puts in order.
+
+Everything that improves a client's model travels like this. Positions never travel: both ends compute them from the
+parameters and what the client holds. Layout: PROTOCOL.md, "Refinement".
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from protocol.errors import LocalWireError, RemoteWireError
+from protocol.lattice import Channel, Parameters
+
+MAGIC = 0x5246
+VERSION = 1
+HEADER = struct.Struct("<HBBBBBBHHIIIHHII")
+CRC = struct.Struct("<I")
+PARAMETERS = struct.Struct("<BHHHHII")
+PARAMETERS_MAX = 4096
+MASK_MAX = 8 << 20
+PAYLOAD_MAX = 256 << 20
+VARINT_MAX = 5
+
+
+class Generator(IntEnum):
+    """How a refinement's samples are found; the number is the one on the wire."""
+
+    COARSE = 0
+    FOVEA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """One refinement of one channel.
+
+    epoch : which opening of a scan it belongs to.      seq : counts refinements in an epoch, from 0.
+    look : the request it answers, 0 for none.          codec : id of the payload's codec.
+    quality : range: quantum in steps; texture: 0..255. samples : values in the payload.
+    self_contained : planned over the first view alone, not over the client's holdings.
+    parameters : of the lattice; None for the first view.
+    mask : range only, which cells are void; empty when none is.
+    """
+
+    generator: Generator
+    channel: Channel
+    epoch: int
+    seq: int
+    look: int
+    codec: int
+    quality: int
+    samples: int
+    payload: bytes = field(repr=False)
+    mask: bytes = field(default=b"", repr=False)
+    parameters: Parameters | None = None
+    self_contained: bool = False
+
+    def to_bytes(self) -> bytes:
+        """Wire form. Raises LocalWireError when a part is too long for it."""
+        parameters = b"" if self.parameters is None else pack_parameters(self.parameters)
+        sizes = (len(parameters), len(self.mask), len(self.payload))
+        if sizes[0] > PARAMETERS_MAX or sizes[1] > MASK_MAX or sizes[2] > PAYLOAD_MAX:
+            raise LocalWireError(f"refinement too long: parameters, mask, payload of {sizes} bytes")
+        header = HEADER.pack(
+            MAGIC, VERSION, self.generator, self.channel, self.codec, int(self.self_contained), 0,
+            self.epoch, self.quality, self.seq, self.look, self.samples, sizes[0], 0, sizes[1], sizes[2],
+        )  # fmt: skip
+        body = b"".join((header, parameters, self.mask, self.payload))
+        return body + CRC.pack(zlib.crc32(body))
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Refinement:
+        """Inverse of to_bytes. Raises RemoteWireError when the bytes are not one whole, intact refinement."""
+        generator, channel, codec, flags, epoch, quality, seq, look, samples, sizes = _read_header(data)
+        ends = [HEADER.size, *_running(HEADER.size, sizes)]
+        if len(data) != ends[-1] + CRC.size:
+            raise RemoteWireError(f"refinement of {len(data)} bytes announces {ends[-1] + CRC.size}")
+        if CRC.unpack_from(data, ends[-1])[0] != zlib.crc32(memoryview(data)[: ends[-1]]):
+            raise RemoteWireError("refinement fails its checksum")
+        parameters = unpack_parameters(data[ends[0] : ends[1]]) if sizes[0] else None
+        if (parameters is None) != (generator is Generator.COARSE):
+            raise RemoteWireError("a first view carries no lattice; everything else does")
+        mask, payload = data[ends[1] : ends[2]], data[ends[2] : ends[3]]
+        return cls(
+            generator, channel, epoch, seq, look, codec, quality, samples, payload, mask, parameters, bool(flags & 1)
+        )
+
+
+def pack_parameters(p: Parameters) -> bytes:
+    """Lattice parameters as they travel: 17 bytes, then the listed runs as varints when there are any."""
+    head = PARAMETERS.pack(p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y)
+    return head + b"".join(_varint(run) for run in p.listed or ())
+
+
+def unpack_parameters(data: bytes) -> Parameters:
+    """Inverse of pack_parameters. Raises RemoteWireError when the bytes are not whole."""
+    if len(data) < PARAMETERS.size:
+        raise RemoteWireError("lattice parameters are cut short")
+    runs = _varints(data[PARAMETERS.size :])
+    return Parameters(*PARAMETERS.unpack_from(data), listed=runs or None)
+
+
+def _read_header(data: bytes) -> tuple[Generator, Channel, int, int, int, int, int, int, int, tuple[int, int, int]]:
+    if len(data) < HEADER.size + CRC.size:
+        raise RemoteWireError("refinement is cut short")
+    (magic, version, generator, channel, codec, flags, _, epoch, quality, seq, look, samples, *sizes) = HEADER.unpack_from(data)
+    if magic != MAGIC or version != VERSION:
+        raise RemoteWireError(f"not a refinement of version {VERSION}")
+    parameters_size, _, mask_size, payload_size = sizes
+    if parameters_size > PARAMETERS_MAX or mask_size > MASK_MAX or payload_size > PAYLOAD_MAX:
+        raise RemoteWireError("refinement announces more than is allowed")
+    try:
+        kind = Generator(generator), Channel(channel)
+    except ValueError as error:
+        raise RemoteWireError(f"refinement of unknown kind: {error}") from None
+    return *kind, codec, flags, epoch, quality, seq, look, samples, (parameters_size, mask_size, payload_size)
+
+
+def _running(start: int, sizes: tuple[int, ...]) -> list[int]:
+    ends = []
+    for size in sizes:
+        start += size
+        ends.append(start)
+    return ends
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _varints(data: bytes) -> tuple[int, ...]:
+    values, value, shift = [], 0, 0
+    for byte in data:
+        value |= (byte & 0x7F) << shift
+        shift += 7
+        if shift > 7 * VARINT_MAX:
+            raise RemoteWireError("run length out of bounds")
+        if not byte & 0x80:
+            values.append(value)
+            value = shift = 0
+    if shift:
+        raise RemoteWireError("run lengths are cut short")
+    return tuple(values)
