@@ -194,7 +194,7 @@ class Hello(_Message, frozen=True):
     protocol: ShortText
     client: ShortText = ""
     token: ShortText = ""
-    codecs: Annotated[list[CodecName], Meta(min_length=1, max_length=8)] = ["htj2k", "jpeg"]  # noqa: RUF012
+    codecs: Annotated[tuple[CodecName, ...], Meta(min_length=1, max_length=8)] = ("htj2k", "jpeg")
 
 
 class Statement(_Part, frozen=True):
