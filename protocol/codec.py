@@ -1,0 +1,121 @@
+"""Range, texture and void mask as payload bytes: the one entrance to the codecs.
+
+A payload holds no header: shape, codec and quality travel in the refinement that carries it, and both ends rebuild the
+headers of JPEG and HTJ2K from them. Lengths and checksums are the carrier's. Decoders read hostile bytes: they bound
+what they allocate by the shape announced, insist on the payload's end, and raise nothing but CodecError.
+
+One scale of texture quality serves both codecs. For HTJ2K it is the quantiser's step, 2**(-quality/8) of full scale; a
+JPEG of equal quality is one of equal PSNR, by the table JPEG_Q. 255 is lossless (HTJ2K only).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from protocol import codec_htj2k, codec_jpeg, codec_mask
+from protocol.errors import CodecError
+from protocol.grid import BoolArray, ImageArray, StepArray
+
+LOSSLESS = codec_htj2k.LOSSLESS
+LOSSY_MAX = codec_htj2k.LOSSY_MAX
+SAMPLES_MAX = 1 << 25
+SIDE_MAX = 16384
+
+
+class TextureCodec(IntEnum):
+    """How texture travels; the numbers are the wire's."""
+
+    JPEG = 1
+    HTJ2K = 2
+
+
+class RangeCodec(IntEnum):
+    """How range travels; the numbers are the wire's."""
+
+    RAW = 0
+    HTJ2K = 2
+
+
+# The Q of the JPEG that matches each quality.
+JPEG_QUALITY_MIN = 32
+JPEG_Q = tuple(int(round(10 + (95 - 10) * n / 39)) for n in range(40))
+JPEG_QUALITY_MAX = JPEG_QUALITY_MIN + len(JPEG_Q) - 1
+
+
+def encode_texture(image: ImageArray, codec: TextureCodec, quality: int) -> bytes:
+    """Payload of an (h, w, 3) uint8 RGB image.
+
+    quality : 0..LOSSY_MAX or LOSSLESS for HTJ2K, JPEG_QUALITY_MIN..JPEG_QUALITY_MAX for JPEG.
+    Raises CodecError for any other quality and for an array that is no such image.
+    """
+    _check_array(image, np.uint8, 3)
+    if codec == TextureCodec.JPEG:
+        return codec_jpeg.encode(image, jpeg_q(quality))
+    return codec_htj2k.encode(image, quality)
+
+
+def decode_texture(payload: bytes, codec: TextureCodec, quality: int, shape: tuple[int, int]) -> ImageArray:
+    """(h, w, 3) uint8 RGB of a payload, shape = (h, w). Raises CodecError."""
+    _check_payload(payload, shape, 3)
+    if codec == TextureCodec.JPEG:
+        return codec_jpeg.decode(payload, shape, jpeg_q(quality))
+    return codec_htj2k.decode(payload, (*shape, 3), quality)  # type: ignore[return-value]
+
+
+def encode_range(values: StepArray, codec: RangeCodec) -> bytes:
+    """Payload of (h, w) uint16 values, exactly. Raises CodecError for an array that is not that."""
+    _check_array(values, np.uint16, 1)
+    if codec == RangeCodec.RAW:
+        return values.astype("<u2").tobytes()
+    return codec_htj2k.encode(values, LOSSLESS)
+
+
+def decode_range(payload: bytes, codec: RangeCodec, shape: tuple[int, int]) -> StepArray:
+    """(h, w) uint16 of a payload, shape = (h, w). Raises CodecError."""
+    _check_payload(payload, shape, 2)
+    if codec == RangeCodec.HTJ2K:
+        return codec_htj2k.decode(payload, shape, LOSSLESS)  # type: ignore[return-value]
+    if len(payload) != 2 * shape[0] * shape[1]:
+        raise CodecError(f"raw range of {shape} takes {2 * shape[0] * shape[1]} bytes, got {len(payload)}")
+    return np.frombuffer(payload, "<u2").astype(np.uint16).reshape(shape)
+
+
+def encode_mask(mask: BoolArray) -> bytes:
+    """Payload of an (h, w) bool mask, true where void; empty when nothing is. Raises CodecError for another array."""
+    _check_array(mask, np.bool_, 1)
+    return codec_mask.encode(mask)
+
+
+def decode_mask(payload: bytes, shape: tuple[int, int]) -> BoolArray:
+    """(h, w) bool of a payload, shape = (h, w). Raises CodecError."""
+    _check_payload(payload, shape, 2)
+    return codec_mask.decode(payload, shape)
+
+
+def jpeg_q(quality: int) -> int:
+    """Q 10..95 of the JPEG that stands for a quality. Raises CodecError outside JPEG_QUALITY_MIN..JPEG_QUALITY_MAX."""
+    if not JPEG_QUALITY_MIN <= quality <= JPEG_QUALITY_MAX:
+        raise CodecError(f"JPEG quality must be {JPEG_QUALITY_MIN}..{JPEG_QUALITY_MAX}, got {quality}")
+    return JPEG_Q[quality - JPEG_QUALITY_MIN]
+
+
+def _check_array(array: np.ndarray, dtype: type[np.generic], channels: int) -> None:
+    expected = 2 if channels == 1 else 3
+    if array.dtype != dtype or array.ndim != expected or (channels == 3 and array.shape[2] != 3):
+        raise CodecError(f"cannot encode {array.shape} {array.dtype}")
+    _check_shape(array.shape[:2])
+
+
+def _check_payload(payload: bytes, shape: tuple[int, int], sample_bytes: int) -> None:
+    _check_shape(shape)
+    limit = 4096 + 2 * sample_bytes * shape[0] * shape[1]
+    if len(payload) > limit:
+        raise CodecError(f"payload of {len(payload)} bytes for {shape} samples; {limit} at most")
+
+
+def _check_shape(shape: tuple[int, ...]) -> None:
+    height, width = shape
+    if not (1 <= height <= SIDE_MAX and 1 <= width <= SIDE_MAX and height * width <= SAMPLES_MAX):
+        raise CodecError(f"shape {shape} is outside 1..{SIDE_MAX} a side and {SAMPLES_MAX} samples")
