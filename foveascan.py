@@ -1,0 +1,190 @@
+"""The command `foveascan`: the one place that knows node, client and simulators, and composes what each of them offers.
+
+A package offers its subcommands in its module `command`:
+
+    def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+        scan = subparsers.add_parser("scan", help="one line, as `foveascan --help` shows it")
+        scan.add_argument("--json", action="store_true", help="print one JSON object a line")
+        scan.set_defaults(run=run_scan)         # run_scan(args: argparse.Namespace) -> int, the exit status
+
+What holds for every subcommand:
+
+- Importing a `command` module costs nothing: argparse and its like at the top, all that is heavy inside `run`.
+- Results go to standard output, progress bars and notices to standard error. With --json standard output carries JSON
+  objects only, one a line.
+- A program that runs until it is told to stop prints {"ready": true, ...} as its first such line once it is ready, and
+  ends cleanly with status 0 on SIGTERM and SIGINT.
+- Failure is raised, not printed: FoveascanError and OSError become one line on standard error here, "foveascan: ...",
+  so their message names the cure. Anything else is a bug, and shows its traceback.
+
+Exit status: 0 done; 1 failed; 2 wrong usage; 130 interrupted; 141 whoever read standard output went away.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from protocol.errors import FoveascanError
+
+__version__ = "0.1.0"
+
+PROGRAM = (sys.executable, "-P", "-m", "foveascan")  # -P: a folder called node or client where one stands is not ours
+READY_LINE_MAX_BYTES = 65536
+END_S = 5.0  # what a program may take to end after SIGTERM
+
+FAILED = 1
+INTERRUPTED = 130
+READER_GONE = 141
+
+CURES = {
+    errno.EACCES: "ask for the right to use it, or run as its owner",
+    errno.EADDRINUSE: "another program listens there: stop it or choose another --listen",
+    errno.EADDRNOTAVAIL: "no such address on this machine: choose another --listen",
+    errno.ECONNREFUSED: "nothing listens there: start a node with `foveascan serve`",
+    errno.EHOSTUNREACH: "check the address and the network",
+    errno.ENOENT: "check the path",
+    errno.ENOSPC: "free some disk space",
+    errno.EROFS: "choose a folder that can be written",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand and return its exit status; `argv` defaults to the command line."""
+    try:
+        try:
+            args = build_parser().parse_args(argv)
+            status: int = args.run(args)
+        finally:
+            sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        _forget_stdout()
+        return READER_GONE
+    except (FoveascanError, OSError) as problem:
+        print(f"foveascan: {one_line(problem)}", file=sys.stderr)
+        return FAILED
+
+
+class _Parser(argparse.ArgumentParser):
+    """Options are spelled out: an abbreviation in somebody's script would break with the next option."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line, composed from what the packages offer."""
+    parser = _Parser(
+        prog="foveascan",
+        description="A turntable 3D scanner as a network appliance: the object at once, full detail where you look.",
+        epilog="Every subcommand has a --help of its own.",
+    )
+    parser.add_argument("--version", action="version", version=f"foveascan {__version__}")
+    subparsers: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
+        title="subcommands", metavar="COMMAND", required=True, parser_class=_Parser
+    )
+    add_own_subcommands(subparsers)
+    return parser
+
+
+def add_own_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Offer what needs several programs at once."""
+    demo = subparsers.add_parser("demo", help="bring up a simulated scanner and a node, sweep once, serve until Ctrl-C")
+    demo.add_argument("--specimen", default="head", metavar="NAME|FILE", help="what stands on the turntable (head)")
+    demo.add_argument("--texture", metavar="IMAGE", help="texture of a specimen read from a .npz grid")
+    demo.add_argument("--size", choices=("S", "M", "L"), default="S", help="size class of the scan (S)")
+    demo.add_argument("--link-rate", metavar="BYTES_S", help="bytes a second over the link, instead of its baud rate")
+    demo.set_defaults(run=run_demo)
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """Simulated scanner and node as processes of their own, one sweep, then serve until a signal."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that both programs are ended with the blocks below
+    with TemporaryDirectory(prefix="foveascan-demo-") as folder:
+        with started(*_simulate(args, f"{folder}/scanner")) as (_, scanner):
+            with started(*_serve(scanner["path"], f"{folder}/library")) as (node, ready):
+                swept = subprocess.run([*PROGRAM, "scan", "--node", ready["url"]])
+                if swept.returncode:
+                    return swept.returncode
+                print(f"The scan is at {ready['url']}\nCtrl-C ends the demo.", flush=True)
+                return node.wait()
+
+
+def _simulate(args: argparse.Namespace, link: str) -> list[str]:
+    command = ["simulate", "--link", "pty", "--path", link, "--json"]
+    for option in ("specimen", "texture", "size", "link_rate"):
+        if (value := getattr(args, option)) is not None:
+            command += [f"--{option.replace('_', '-')}", value]
+    return command
+
+
+def _serve(scanner: str, library: str) -> list[str]:
+    return ["serve", "--scanner", scanner, "--library", library, "--listen", "127.0.0.1:0", "--insecure", "--json"]
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any]]]:
+    """Another subcommand (given --json) as a process, with the line that says it is ready; ended with the block.
+
+    Raises FoveascanError when it ends, or says anything else, before it is ready.
+    """
+    with subprocess.Popen([*PROGRAM, *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as program:
+        try:
+            yield program, _ready_line(program, arguments[0])
+        finally:
+            _end(program)
+
+
+def _ready_line(program: subprocess.Popen[bytes], name: str) -> dict[str, Any]:
+    assert program.stdout is not None
+    line = program.stdout.readline(READY_LINE_MAX_BYTES)
+    if not line:
+        raise FoveascanError(f"{name} ended with status {program.wait()} before it was ready: see its message above")
+    try:
+        ready: dict[str, Any] = json.loads(line)
+    except ValueError as problem:
+        raise FoveascanError(f"{name} began with {line[:80]!r} instead of a line of JSON") from problem
+    return ready
+
+
+def _end(program: subprocess.Popen[bytes]) -> None:
+    program.terminate()
+    try:
+        program.wait(END_S)
+    except subprocess.TimeoutExpired:
+        program.kill()
+
+
+def one_line(problem: Exception) -> str:
+    """What went wrong and its cure, without line breaks."""
+    cure = CURES.get(problem.errno or 0) if isinstance(problem, OSError) else None
+    text = f"{_what(problem)}; {cure}" if cure else _what(problem)
+    return " ".join(text.split())
+
+
+def _what(problem: Exception) -> str:
+    if isinstance(problem, OSError) and problem.strerror:
+        place = f"{os.fsdecode(problem.filename)}: " if isinstance(problem.filename, str | bytes) else ""
+        return f"{place}{problem.strerror}"
+    return str(problem) or type(problem).__name__
+
+
+def _forget_stdout() -> None:
+    """Let the interpreter's own flush at exit find an open file, else it complains on standard error."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
