@@ -10,10 +10,10 @@ A package offers its subcommands in its module `command`:
 What holds for every subcommand:
 
 - Importing a `command` module costs nothing: argparse and its like at the top, all that is heavy inside `run`.
-- Results go to standard output, progress bars and notices to standard error. With --json standard output carries JSON
-  objects only, one a line.
-- A program that runs until it is told to stop prints {"ready": true, ...} as its first such line once it is ready, and
-  ends cleanly with status 0 on SIGTERM and SIGINT.
+- Results go to standard output; progress bars (tqdm with disable=None: silent where nobody watches) and notices to
+  standard error. With --json standard output carries JSON objects only, one a line.
+- A program that runs until it is told to stop prints {"ready": true, ...} with --json once it is ready, and nothing
+  more there, since whoever started it reads no further. It ends cleanly with status 0 on SIGTERM and SIGINT.
 - Failure is raised, not printed: FoveascanError and OSError become one line on standard error here, "foveascan: ...",
   so their message names the cure. Anything else is a bug, and shows its traceback.
 
