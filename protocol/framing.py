@@ -15,6 +15,7 @@ from __future__ import annotations
 import binascii
 import struct
 import zlib
+from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 from typing import NamedTuple
 
@@ -50,6 +51,7 @@ class DropReason(StrEnum):
     TRUNCATED = "frame stopped in the middle"
     SESSION = "frame belongs to another session"
     UNKNOWN = "message type is unknown"
+    STRAY = "message is not for this end of the link"
     MALFORMED = "message does not follow its table"
 
 
@@ -69,7 +71,8 @@ class Frame(NamedTuple):
         return FRAME_OVERHEAD + len(self.payload)
 
 
-class Dropped(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Dropped:
     """A run of `count` bytes that held no readable frame; `reason` is what was wrong with the first of them."""
 
     reason: DropReason

@@ -288,7 +288,7 @@ class Calibrate:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Device to host, CAL_REPORT: the table stands at home; `calibration` names the factory and home settings in use."""
+    """Device to host, CAL_REPORT: the table stands at home; `calibration` names the settings in use there."""
 
     TYPE: ClassVar[int] = 0x12
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<Qi")
@@ -376,11 +376,12 @@ class SweepHeader:
     @classmethod
     def from_bytes(cls, payload: Payload) -> Self:
         """Inverse of to_bytes."""
-        step_mm, pitch_mm, z_max_mm, theta0_rad, calibration, counts, start, sweep, *rest = _unpack(cls._LAYOUT, payload)
-        width, height, texture_width, texture_height, range_rows, texture_rows, channels, passes, direction = rest
+        fields = _unpack(cls._LAYOUT, payload)
+        geometry, (calibration, counts, start, sweep) = fields[:4], fields[4:8]
+        shape, (range_rows, texture_rows, channels, passes, direction) = fields[8:12], fields[12:]
         _check(counts > 0 and range_rows > 0 and texture_rows > 0, "counts_per_turn and rows must be positive")
         _check(direction in (1, -1), "direction must be 1 or -1")
-        spec = GridSpec(width, height, texture_width, texture_height, step_mm, pitch_mm, z_max_mm, theta0_rad)
+        spec = GridSpec(*shape, *geometry)
         return cls(
             sweep, spec, counts, range_rows, texture_rows, _channels(channels), _passes(passes), start, direction,
             calibration,

@@ -1,0 +1,178 @@
+"""What carries a simulated scanner's bytes: nothing but memory, with a time of its own; or a pty as slow as its baud rate."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from protocol.errors import PortLost
+from simulators.scanner import SimulatedScanner
+
+_READ_BYTES = 65536
+_PORTION_BYTES = 4096
+_BITS_PER_BYTE = 10  # start, eight data, stop
+_CATCH_UP_S = 0.02  # a sleep that came back late may be made good up to this
+_DEAF_S = 1.0  # a UART would have sent its bits into the void by then
+
+Line = Callable[[bytes], bytes]
+
+
+def clean_line(data: bytes) -> bytes:
+    """A line that changes nothing."""
+    return data
+
+
+class MemoryPort:
+    """The node's port to a simulated scanner in the same thread, in a time that passes only while somebody reads.
+
+    `clock` tells that time. rate_bytes_s : speed towards the node.  to_node, to_scanner : what happens to bytes on the
+    way, for lines that lose or change some. Satisfies drivers.port.Port.
+    """
+
+    name = "memory"
+
+    def __init__(
+        self,
+        scanner: SimulatedScanner,
+        *,
+        rate_bytes_s: float = math.inf,
+        step_s: float = 0.005,
+        to_node: Line = clean_line,
+        to_scanner: Line = clean_line,
+    ) -> None:
+        self._scanner = scanner
+        self._portion_bytes = int(min(rate_bytes_s * step_s, _READ_BYTES))
+        self._step_s = step_s
+        self._to_node, self._to_scanner = to_node, to_scanner
+        self._now_s = 0.0
+        self._arrived = b""
+        self._is_cancelled = threading.Event()
+        self._is_unplugged = False
+
+    def clock(self) -> float:
+        """The time on this port. [s]"""
+        return self._now_s
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """As Port.read; time passes in steps until bytes arrive or `timeout_s` is over."""
+        self._check_plugged()
+        until_s = self._now_s + timeout_s
+        while not self._arrived and self._now_s < until_s and not self._is_cancelled.is_set():
+            self._pass_time(min(self._step_s, until_s - self._now_s))
+        self._is_cancelled.clear()
+        data, self._arrived = self._arrived[:max_bytes], self._arrived[max_bytes:]
+        return data
+
+    def write(self, data: bytes) -> None:
+        """As Port.write."""
+        self._check_plugged()
+        self._scanner.receive_data(self._to_scanner(data), self._now_s)
+
+    def cancel(self) -> None:
+        """As Port.cancel."""
+        self._is_cancelled.set()
+
+    def close(self) -> None:
+        """As Port.close."""
+        self._is_unplugged = True
+
+    def unplug(self) -> None:
+        """Pull the plug: every later use raises PortLost."""
+        self._is_unplugged = True
+
+    def _pass_time(self, dt_s: float) -> None:
+        before_s, self._now_s = self._now_s, self._now_s + dt_s
+        if self._now_s == before_s:  # a step too short for the clock to show
+            self._now_s = math.nextafter(before_s, math.inf)
+        self._scanner.step(self._now_s)
+        self._arrived += self._to_node(self._scanner.data_to_send(self._portion_bytes))
+
+    def _check_plugged(self) -> None:
+        if self._is_unplugged:
+            raise PortLost(f"{self.name}: unplugged")
+
+
+class PtyPort:
+    """The scanner's end of a pseudo terminal that lets bytes through no faster than a serial line of `baud`.
+
+    link_path : a symbolic link that leads to the node's end; it exists as long as this is open.
+    """
+
+    def __init__(self, link_path: Path, baud: int = 3_000_000) -> None:
+        self.name = str(link_path)
+        self._link_path = link_path
+        self._rate_bytes_s = baud / _BITS_PER_BYTE
+        self._free_s = 0.0
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._wake_read, self._wake_write = os.pipe()
+        self._target = os.ttyname(self._slave)
+        _replace_link(link_path, self._target)
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """As Port.read."""
+        ready, _, _ = select.select([self._master, self._wake_read], [], [], max(timeout_s, 0.0))
+        if self._wake_read in ready:
+            os.read(self._wake_read, 1)
+        return os.read(self._master, max_bytes) if self._master in ready else b""
+
+    def write(self, data: bytes) -> None:
+        """Send `data` at the pace of the line; bytes that nobody takes for a second are lost, as on a real line."""
+        rest = memoryview(data)
+        while rest:
+            _, writable, _ = select.select([], [self._master], [], _DEAF_S)
+            if not writable:
+                break
+            with suppress(BlockingIOError):
+                rest = rest[os.write(self._master, rest) :]
+        self._pace(len(data))
+
+    def cancel(self) -> None:
+        """As Port.cancel."""
+        os.write(self._wake_write, b"x")
+
+    def close(self) -> None:
+        """Hang up, which is what pulling the plug looks like, and take the link away."""
+        with suppress(OSError):
+            if os.readlink(self._link_path) == self._target:
+                os.unlink(self._link_path)
+        for descriptor in (self._master, self._slave, self._wake_read, self._wake_write):
+            os.close(descriptor)
+
+    def _pace(self, size_bytes: int) -> None:
+        """Sleep as long as the line needs for that many bytes."""
+        now_s = time.monotonic()
+        self._free_s = max(self._free_s, now_s - _CATCH_UP_S) + size_bytes / self._rate_bytes_s
+        if self._free_s > now_s:
+            time.sleep(self._free_s - now_s)
+
+
+def serve(scanner: SimulatedScanner, port: PtyPort, stop: threading.Event) -> None:
+    """Run a scanner on a port until `stop` is set (and the port's `cancel` called, to be heard at once)."""
+    while not stop.is_set():
+        now_s = time.monotonic()
+        data = port.read(_READ_BYTES, scanner.wait_s(now_s))
+        now_s = time.monotonic()
+        if data:
+            scanner.receive_data(data, now_s)
+        scanner.step(now_s)
+        data = scanner.data_to_send(_PORTION_BYTES)
+        if data:
+            port.write(data)
+
+
+def _replace_link(path: Path, target: str) -> None:
+    """Make `path` a symbolic link to `target`, in one step; FileExistsError where something else stands there."""
+    if path.exists(follow_symlinks=False) and not path.is_symlink():
+        raise FileExistsError(f"{path} exists and is no symbolic link")
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    os.symlink(target, fresh)
+    os.replace(fresh, path)

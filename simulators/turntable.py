@@ -1,0 +1,165 @@
+"""A turntable with a range camera and a colour camera: knows angles, counts and time, and nothing of bytes.
+
+The table turns counter-clockwise seen from above. Each camera is triggered once per column by the encoder; jitter moves
+the moment of the trigger, and the encoder says truly where the table stood then. Time enters as `step(dt_s)`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.grid import Grid, ImageArray, IntArray, StepArray
+from protocol.scanner_messages import Channel
+
+_COUNTS_MIN = 65536  # a coarser encoder would make jitter a matter of one or two counts
+_COUNT_LIMIT = 2**31
+_JITTER_REACH = 0.4  # of a column; so columns of one channel never change places
+
+
+class Standing(Protocol):
+    """What can stand on the table (simulators.specimen.Specimen does)."""
+
+    @property
+    def grid(self) -> Grid:
+        """Its truth, and the geometry of that."""
+        ...
+
+    def range_column(self, angle_rad: float) -> StepArray:
+        """(H,) uint16 steps seen at an angle."""
+        ...
+
+    def texture_column(self, angle_rad: float) -> ImageArray:
+        """(Ht, 3) uint8 RGB seen at an angle."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """One column was seen: by which camera, in which pass, at which encoder count and time."""
+
+    channel: Channel
+    pass_index: int
+    column: int
+    encoder: int
+    time_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Schedule:
+    """Triggers of a sweep in the order of their counts: four arrays (n,)."""
+
+    counts: IntArray
+    channels: IntArray
+    passes: IntArray
+    columns: IntArray
+
+
+class Turntable:
+    """Table, cameras, and what stands there.
+
+    turn_s : time of a turn at full speed.     jitter_counts : standard deviation of the trigger. [encoder counts]
+    home_encoder : count at the home mark, where the angle is the specimen's theta0_rad.
+    Without jitter every column is seen at exactly its nominal angle: a turn has counts for each of them.
+    """
+
+    def __init__(
+        self, specimen: Standing, *, turn_s: float = 1.0, jitter_counts: float = 0.0, home_encoder: int = 0, seed: int = 0
+    ) -> None:
+        spec = specimen.grid.spec
+        nominal = math.lcm(2 * spec.width, 2 * spec.texture_width)
+        self.specimen = specimen
+        self.counts_per_turn = nominal * -(-_COUNTS_MIN // nominal)
+        self.home_encoder = home_encoder
+        self._rate = self.counts_per_turn / turn_s
+        self._jitter_counts = jitter_counts
+        self._rng = np.random.default_rng(seed)
+        self._time_s = 0.0
+        self._position = 0.0  # counts since the home mark of this movement
+        self._goal = 0.0
+        self._next = 0
+        self._schedule = self._plan(Channel(0), 0)
+
+    @property
+    def encoder(self) -> int:
+        """Where the table stands. [counts]"""
+        return self.home_encoder + math.floor(self._position)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether it is on its way somewhere."""
+        return self._position < self._goal
+
+    def home(self) -> None:
+        """Set out for the home mark."""
+        self._set_out(self._plan(Channel(0), 0), 0)
+
+    def begin(self, channels: Channel, passes: int) -> None:
+        """Set out for a sweep, which begins at the home mark. Raises ValueError if the encoder cannot count so far."""
+        if abs(self.home_encoder) + (passes + 1) * self.counts_per_turn >= _COUNT_LIMIT:
+            raise ValueError(f"{passes} passes of {self.counts_per_turn} counts overrun the encoder")
+        self._set_out(self._plan(channels, passes), passes * self.counts_per_turn)
+
+    def halt(self) -> None:
+        """Stop where it stands."""
+        self._goal = self._position
+
+    def step(self, dt_s: float, room: int) -> list[Exposure]:
+        """Let time pass. Returns what was exposed; the table stops at the last column there is `room` for."""
+        schedule, position = self._schedule, self._position
+        reach = min(position + self._rate * dt_s, self._goal)
+        end = int(np.searchsorted(schedule.counts, reach, "right"))
+        if end > self._next + room:
+            end = self._next + room
+            reach = max(position, float(schedule.counts[end - 1])) if end else position
+        seen = [self._expose(i, position) for i in range(self._next, end)]
+        self._next, self._position = end, reach
+        self._time_s += dt_s
+        return seen
+
+    def samples(self, exposure: Exposure) -> StepArray | ImageArray:
+        """What the camera saw: (H,) uint16 steps or (Ht, 3) uint8 RGB."""
+        turn = (exposure.encoder - self.home_encoder) / self.counts_per_turn
+        angle_rad = self.specimen.grid.spec.theta0_rad + 2 * math.pi * turn
+        if exposure.channel is Channel.RANGE:
+            return self.specimen.range_column(angle_rad)
+        return self.specimen.texture_column(angle_rad)
+
+    def _expose(self, index: int, position: float) -> Exposure:
+        """Trigger number `index`, while the table moves on from `position`."""
+        schedule = self._schedule
+        count = int(schedule.counts[index])
+        time_s = self._time_s + max(0.0, (count - position) / self._rate)
+        channel = Channel(int(schedule.channels[index]))
+        place = int(schedule.passes[index]), int(schedule.columns[index])
+        return Exposure(channel, *place, self.home_encoder + count, round(1e6 * time_s))
+
+    def _set_out(self, schedule: _Schedule, goal: float) -> None:
+        """Take the next home mark ahead as the origin, and `goal` counts behind it as the end."""
+        beyond = self._position % self.counts_per_turn
+        self._position = beyond - self.counts_per_turn if beyond else 0.0
+        self._schedule, self._goal, self._next = schedule, goal, 0
+
+    def _plan(self, channels: Channel, passes: int) -> _Schedule:
+        spec = self.specimen.grid.spec
+        widths = {Channel.RANGE: spec.width, Channel.TEXTURE: spec.texture_width}
+        parts = [self._plan_channel(channel, width, passes) for channel, width in widths.items() if channel in channels]
+        table = np.concatenate([*parts, np.empty((0, 4), np.int64)])
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        return _Schedule(*(np.ascontiguousarray(part) for part in table.T))
+
+    def _plan_channel(self, channel: Channel, width: int, passes: int) -> IntArray:
+        """(passes * width, 4) count, channel, pass, column of one camera's triggers."""
+        index = np.arange(passes * width)
+        spacing = self.counts_per_turn // width
+        counts = (2 * index + 1) * (spacing // 2) + self._jitter(len(index), spacing)
+        return np.stack([counts, np.full_like(index, channel), index // width, index % width], axis=1)
+
+    def _jitter(self, n: int, spacing: int) -> NDArray[np.int64]:
+        """(n,) displacements of triggers `spacing` counts apart. [counts]"""
+        reach = int(_JITTER_REACH * spacing)
+        return np.clip(np.rint(self._rng.normal(0.0, self._jitter_counts, n)), -reach, reach).astype(np.int64)
