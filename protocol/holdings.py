@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.errors import LatticeError
 from protocol.grid import RANGE_BLOCK, BoolArray, IntArray, StepArray
-from protocol.lattice import LEVEL_MAX, Channel, ChannelShape, Lattice
+from protocol.lattice import Channel, ChannelShape, Lattice
 
 LevelArray = NDArray[np.uint8]
 RankArray = NDArray[np.uint16]
@@ -25,6 +25,7 @@ HashArray = NDArray[np.uint32]
 
 COARSE_RANK = 0
 RANK_MARGIN = {Channel.RANGE: 1, Channel.TEXTURE: 3}
+RANK_MAX = {Channel.RANGE: 65534, Channel.TEXTURE: 256}
 
 
 def range_rank(quantum: int) -> int:
@@ -84,12 +85,15 @@ class ChannelHoldings:
     @classmethod
     def from_runs(cls, shape: ChannelShape, runs: list[list[int]]) -> ChannelHoldings:
         """Inverse of to_runs. Raises LatticeError unless every run is in bounds and all add up to the blocks."""
-        table = np.asarray(runs if runs else np.zeros((0, 3)), np.int64)
         size = shape.blocks[0] * shape.blocks[1]
-        if table.ndim != 2 or table.shape[1] != 3 or np.any(table < 0) or np.any(table[:, 0] > size):
-            raise LatticeError("holdings runs must be [count, level, rank] in bounds")
-        if table[:, 0].sum() != size or np.any(table[:, 1] > LEVEL_MAX) or np.any(table[:, 2] > 65535):
-            raise LatticeError(f"holdings runs must cover {size} blocks with known levels and ranks")
+        try:
+            table = np.array(runs, np.int64).reshape(len(runs), 3)
+        except (ValueError, OverflowError):
+            raise LatticeError("holdings runs must be [count, level, rank]") from None
+        if np.any(table < (1, 0, COARSE_RANK)) or np.any(table > (size, shape.coarse_level, RANK_MAX[shape.channel])):
+            raise LatticeError("holdings runs must have known levels and ranks")
+        if table[:, 0].sum() != size:
+            raise LatticeError(f"holdings runs must cover {size} blocks")
         level = np.repeat(table[:, 1], table[:, 0]).astype(np.uint8).reshape(shape.blocks)
         return cls(shape, level, np.repeat(table[:, 2], table[:, 0]).astype(np.uint16).reshape(shape.blocks))
 
@@ -98,7 +102,7 @@ class Holdings:
     """Holdings of both channels and the digest that proves two ends agree.
 
     The digest covers every level and rank, and the decoded integer range of every block adopted since both ends last
-    set out from the same word (the first view, or a statement of holdings). Texture pixels are left out: decoders differ.
+    set out from the same word (first view or stated holdings). Texture pixels are left out: decoders differ.
     """
 
     def __init__(self, channels: dict[Channel, ChannelHoldings], content: int = 0) -> None:
@@ -139,7 +143,7 @@ def mix32(values: HashArray) -> HashArray:
     return h
 
 
-_WEIGHTS = mix32(np.arange(1, RANGE_BLOCK * RANGE_BLOCK + 1, dtype=np.uint32)).reshape(RANGE_BLOCK, RANGE_BLOCK) | np.uint32(1)
+_WEIGHTS = mix32(np.arange(1, RANGE_BLOCK**2 + 1, dtype=np.uint32)).reshape(RANGE_BLOCK, RANGE_BLOCK) | np.uint32(1)
 
 
 def hash_blocks(cells: StepArray) -> HashArray:

@@ -20,7 +20,7 @@ from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, BoolArray, GridSpec, IntAr
 QUARTERS = 4
 RHO_ONE = 1 << 16
 RHO_MAX = 1 << 20
-NO_SKIRT = RHO_MAX
+NO_SKIRT = 0
 LEVEL_MAX = 40
 _LEVEL_BOUNDS = (QUARTERS * QUARTERS) * (1 << np.arange(LEVEL_MAX, dtype=np.int64))
 
@@ -72,7 +72,9 @@ class ChannelShape:
         return (2, 4, 8, 16) if self.channel is Channel.RANGE else (2, 3, 4, 6, 8, 12, 16)
 
 
-def channel_shapes(spec: GridSpec, coarse_range: tuple[int, int], coarse_texture: tuple[int, int]) -> dict[Channel, ChannelShape]:
+def channel_shapes(
+    spec: GridSpec, coarse_range: tuple[int, int], coarse_texture: tuple[int, int]
+) -> dict[Channel, ChannelShape]:
     """Shapes of both channels of a scan; coarse shapes are (rows, columns)."""
     return {
         Channel.RANGE: ChannelShape(Channel.RANGE, spec.width, spec.height, coarse_range[1], coarse_range[0]),
@@ -88,8 +90,8 @@ class Parameters:
 
     half_spacing : 2 p, p the plateau's sample spacing.
     block_x, block_y, blocks_wide, blocks_high : the plateau, in blocks; it may wrap in x, not in y.
-    rho_x, rho_y : growth of the skirt's steps, round(65536 exp(1/S')); 65536..2^20.
-    listed : None, or run lengths over the plateau's blocks in row order, unlisted first: only listed blocks are adopted.
+    rho_x, rho_y : growth of the skirt's steps, round(65536 exp(1/S')), 65536..2^20; 0 for no skirt.
+    listed : None, or run lengths over the plateau's blocks in row order, unlisted first: only listed ones are adopted.
     """
 
     half_spacing: int
@@ -113,7 +115,7 @@ class Axis:
 
     at : (m,) int64 strictly ascending positions, in quarter samples, not wrapped; ring ends and clamped edges included.
     sample : (m,) int64 which of the `count` transmitted samples stands there.
-    border : int64 the half-sample positions it was grown from: samples (range, (count,)) or cell borders (texture, (count + 1,)).
+    border : int64 half-sample positions: of samples (range, (count,)), or of the cells' borders (texture, (count + 1,)).
     block, start, stop : (b,) int64 the blocks this axis covers: index, first and past-last dense position, not wrapped.
     gap : (b,) int64 the widest interval each block's stencil touches, in quarter samples.
     first, last : (b,) int64 the outermost entries of `at` in that stencil.
@@ -135,7 +137,7 @@ class Axis:
 class Lattice:
     """Sample positions of a refinement and the blocks they cover.
 
-    level : (by, bx) int64 level each covered block would reach.   listed : (by, bx) bool, False where not to be adopted.
+    level : (by, bx) int64 level each covered block would reach.   listed : (by, bx) bool, which may be adopted.
     """
 
     shape: ChannelShape
@@ -150,8 +152,8 @@ def build_lattice(shape: ChannelShape, parameters: Parameters) -> Lattice:
     """Compute a lattice from what travelled. Raises LatticeError when the parameters describe none."""
     _check(shape, parameters)
     x, y = _axis_x(shape, parameters), _axis_y(shape, parameters)
-    gap = np.maximum(y.gap[:, None], x.gap[None, :])
-    return Lattice(shape, parameters, x, y, level_of_gap(gap), _listed(shape, parameters, x, y))
+    level = np.maximum.outer(level_of_gap(y.gap), level_of_gap(x.gap))
+    return Lattice(shape, parameters, x, y, level, _listed(shape, parameters, x, y))
 
 
 def level_of_gap(gap: IntArray) -> IntArray:
@@ -162,11 +164,11 @@ def level_of_gap(gap: IntArray) -> IntArray:
 def skirt_steps(half_spacing: int, rho: int, coarse_spacing: int, reach: int) -> list[int]:
     """Steps of a skirt, outward, in whole samples: growing by rho/65536, none above coarse_spacing, enough to reach.
 
-    s_0 = p 2^16, s_k = (s_{k-1} rho + 2^15) >> 16, step_k = (s_k + 2^15) >> 16 (F-07b).
+    s_0 = p 2^16, s_k = (s_{k-1} rho + 2^15) >> 16, step_k = (s_k + 2^15) >> 16 (F-07b). rho = 0: no steps.
     """
     steps: list[int] = []
     fixed = half_spacing << 15
-    while reach > 0:
+    while reach > 0 and rho != NO_SKIRT:
         fixed = (fixed * rho + (1 << 15)) >> 16
         step = (fixed + (1 << 15)) >> 16
         if step > coarse_spacing:
@@ -178,10 +180,9 @@ def skirt_steps(half_spacing: int, rho: int, coarse_spacing: int, reach: int) ->
 
 def runs_to_mask(runs: tuple[int, ...], size: int) -> BoolArray:
     """Run lengths, False first, to a mask of `size`. Raises LatticeError unless they add up to it."""
-    lengths = np.asarray(runs, np.int64)
-    if lengths.ndim != 1 or np.any(lengths < 0) or int(lengths.sum()) != size:
+    if any(not 0 <= run <= size for run in runs) or sum(runs) != size:
         raise LatticeError(f"runs must add up to {size} blocks")
-    return np.repeat(np.arange(lengths.size) % 2 == 1, lengths)
+    return np.repeat(np.arange(len(runs)) % 2 == 1, runs)
 
 
 def mask_to_runs(mask: BoolArray) -> tuple[int, ...]:
@@ -199,8 +200,8 @@ def _check(shape: ChannelShape, p: Parameters) -> None:
         raise LatticeError(f"plateau columns {p.block_x}+{p.blocks_wide} do not fit {columns} blocks")
     if not (0 <= p.block_y and 1 <= p.blocks_high and p.block_y + p.blocks_high <= rows):
         raise LatticeError(f"plateau rows {p.block_y}+{p.blocks_high} do not fit {rows} blocks")
-    if not (RHO_ONE <= p.rho_x <= RHO_MAX and RHO_ONE <= p.rho_y <= RHO_MAX):
-        raise LatticeError(f"rho must be between {RHO_ONE} and {RHO_MAX}")
+    if any(rho != NO_SKIRT and not RHO_ONE <= rho <= RHO_MAX for rho in (p.rho_x, p.rho_y)):
+        raise LatticeError(f"rho must be {NO_SKIRT} or between {RHO_ONE} and {RHO_MAX}")
     if shape.channel is Channel.RANGE and 2 * shape.width % p.half_spacing:
         raise LatticeError(f"spacing {p.spacing} does not divide the {shape.width} columns")
     if p.blocks_wide == columns and (p.block_x or 2 * shape.width % p.half_spacing):
@@ -216,9 +217,10 @@ def _axis_x(shape: ChannelShape, p: Parameters) -> Axis:
     if p.blocks_wide == columns:
         return _ring(shape, p.half_spacing)
     plateau = _plateau(2 * start, 2 * stop, p.half_spacing)
-    border = _grow_both(plateau, _half_steps(shape, p.half_spacing, p.rho_x, width, shape.coarse_width), 2 * (width - 1))
+    steps = _half_steps(shape, p.half_spacing, p.rho_x, width, shape.coarse_width)
+    border = _grow_both(plateau, steps, 2 * (width - 1))
     at = _positions(shape, border)
-    return _cover(at, np.arange(at.size), border, _turns(shape, (-1, 0, 1)))
+    return _cover(at, np.arange(at.size), np.diff(at), border, _turns(shape, (-1, 0, 1)))
 
 
 def _axis_y(shape: ChannelShape, p: Parameters) -> Axis:
@@ -232,8 +234,8 @@ def _axis_y(shape: ChannelShape, p: Parameters) -> Axis:
     below = _until_edge(plateau[-1] + outward, edge) if plateau[-1] < edge else outward[:0]
     above = -_until_edge(-plateau[0] + outward, 0) if plateau[0] > 0 else outward[:0]
     border = np.concatenate([above[::-1], plateau, below])
-    at, sample = _clamp(_positions(shape, border), shape, border)
-    return _cover(at, sample, border, _turns(shape, (0,), vertical=True))
+    at, sample, interval = _clamp(_positions(shape, border), shape, border)
+    return _cover(at, sample, interval, border, _turns(shape, (0,), vertical=True))
 
 
 def _plateau(start: int, stop: int, half_spacing: int) -> IntArray:
@@ -279,22 +281,25 @@ def _ring(shape: ChannelShape, half_spacing: int) -> Axis:
     border = np.arange(0, 2 * shape.width + 1, half_spacing, dtype=np.int64)
     at = _positions(shape, border)
     if shape.channel is Channel.RANGE:
-        at = at[:-1]
+        at, border = at[:-1], border[:-1]
     count, turn = at.size, QUARTERS * shape.width
     sample = np.concatenate([[count - 1], np.arange(count), [0]])
     at = np.concatenate([[at[-1] - turn], at, [at[0] + turn]])
-    return _cover(at, sample, border, _turns(shape, (0,)))
+    return _cover(at, sample, np.diff(at), border, _turns(shape, (0,)))
 
 
-def _clamp(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[IntArray, IntArray]:
-    """At an image edge the outermost cell serves up to the edge itself (texture rows)."""
-    sample = np.arange(at.size)
+def _clamp(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """At an image edge the outermost cell serves up to the edge itself (texture rows).
+
+    Returns at, sample and the intervals between; the one at the edge counts as wide as its cell is high.
+    """
+    sample, interval, cell = np.arange(at.size), np.diff(at), 2 * np.diff(border)
     bottom = QUARTERS * (shape.height - 1)
     if border[0] == 0 and at[0] > 0:
-        at, sample = np.append(0, at), np.append(0, sample)
+        at, sample, interval = np.append(0, at), np.append(0, sample), np.append(cell[0], interval)
     if shape.channel is Channel.TEXTURE and border[-1] == 2 * shape.height and at[-1] < bottom:
-        at, sample = np.append(at, bottom), np.append(sample, sample[-1])
-    return at, sample
+        at, sample, interval = np.append(at, bottom), np.append(sample, sample[-1]), np.append(interval, cell[-1])
+    return at, sample, interval
 
 
 def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) -> tuple[IntArray, IntArray, IntArray]:
@@ -307,14 +312,16 @@ def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) 
     return np.tile(index, len(turns)), np.tile(start, len(turns)) + offset, np.tile(stop, len(turns)) + offset
 
 
-def _cover(at: IntArray, sample: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray]) -> Axis:
+def _cover(
+    at: IntArray, sample: IntArray, interval: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray]
+) -> Axis:
     """Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches."""
     index, start, stop = blocks
     first = np.searchsorted(at, QUARTERS * start, side="right") - 1
     last = np.searchsorted(at, QUARTERS * (stop - 1), side="left")
     inside = (first >= 0) & (last < at.size)
     index, start, stop, first, last = (a[inside] for a in (index, start, stop, first, last))
-    gap = _widest(np.diff(at), first, last)
+    gap = _widest(interval, first, last)
     return Axis(at, sample, int(sample.max()) + 1, border, index, start, stop, gap, first, last)
 
 
