@@ -104,19 +104,6 @@ class LookParameters(_Part, frozen=True):
     texture: TextureParameters | None = None
 
 
-class Sent(_Part, frozen=True):
-    """What one refinement of an update was: the lattice that travelled, in words."""
-
-    channel: Literal["range", "texture"]
-    p: float
-    quality: int
-    codec: ShortText
-    plateau: Annotated[list[int], Meta(min_length=4, max_length=4)]
-    rho: Annotated[list[int], Meta(min_length=2, max_length=2)]
-    samples: Count
-    payload_bytes: ByteCount
-
-
 # From the node
 
 
@@ -145,13 +132,15 @@ class Opened(_Message, frozen=True):
 
 
 class Updated(_Message, frozen=True):
-    """All refinements of a look are sent: why it ended, what was used, what is left."""
+    """All refinements of a look are sent, those before next_seq: why it ended and what is left.
+
+    error_max_mm : largest range error left in the window.  texture_db : PSNR reached in it.  (None: not looked at.)
+    encodes : images the node coded for it.  node_ms : time it spent.
+    """
 
     request: Count
-    reason: Literal["complete", "byte limit", "superseded"]
     next_seq: Count
-    byte_count: ByteCount
-    sent: list[Sent]
+    reason: Literal["complete", "byte limit", "superseded"]
     error_max_mm: float | None = None
     texture_db: float | None = None
     encodes: int = 0

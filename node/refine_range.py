@@ -1,0 +1,157 @@
+"""Range for a look: which spacing and quantum reach the quality asked for, and the refinement that carries them.
+
+Bytes hang on the spacing far more than on the quantum, so the widest spacing that can reach the quality wins, and then
+the largest quantum that still does. Every trial is reconstructed and compared with the scan, as the client will see it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from node.coded import Coded, rho_of
+from node.library import Scan
+from node.sample import range_samples, void_cells
+from node.state import ClientState, block_errors
+from protocol.codec import RangeCodec, encode_mask, encode_range
+from protocol.grid import VOID, StepArray
+from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
+from protocol.lattice import Channel, Parameters, build_lattice
+from protocol.messages import RangeParameters
+from protocol.reconstruct import Selection, content_hashes, cut, dequantise, quantise, range_patch, select
+from protocol.region import Region
+
+PERCENTILE = 99
+QUANTUM_MAX = 4096
+SKIRT_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A spacing and quantum, and the error they leave in the region. [steps]"""
+
+    parameters: RangeParameters
+    error: float
+
+
+def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: float) -> Choice:
+    """The cheapest parameters whose error in the region is at most target_steps (99th percentile, "higher")."""
+    fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
+    finest: Choice | None = None
+    for p in (8, 4, 2, 1):
+        selection = _trial_selection(fresh, region, p)
+        if selection is None or (p > 1 and target_steps < 1):
+            continue
+        trial = _Trial(scan, selection, region)
+        if trial.error(1) <= target_steps:
+            quantum = _largest_quantum(trial, target_steps)
+            return Choice(RangeParameters(p=p, quantum=quantum, s=SKIRT_S), trial.error(quantum))
+        finest = Choice(RangeParameters(p=p, quantum=1, s=SKIRT_S), trial.error(1))
+    return finest or Choice(RangeParameters(p=1, quantum=1, s=SKIRT_S), 0.0)
+
+
+def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangeParameters) -> Coded | None:
+    """Encode a refinement of the region's blocks, or None when the client holds all of it already.
+
+    Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
+    Raises LatticeError for a spacing that does not fit the scan.
+    """
+    held = state.holdings.channels[Channel.RANGE]
+    lattice = build_lattice(held.shape, range_lattice(region, wanted))
+    quantum = min(wanted.quantum, _best_held(held, lattice))
+    found = select(lattice, held, range_rank(quantum))
+    if found is None:
+        return None
+    selection, adopted = found
+    void = void_cells(scan, selection)
+    payload = encode_range(quantise(range_samples(scan, selection), quantum), RangeCodec.HTJ2K)
+    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.HTJ2K, payload, encode_mask(void))
+
+
+def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
+    """The lattice of a region's blocks."""
+    rho = rho_of(wanted.s)
+    return Parameters(2 * wanted.p, *region.blocks(8), rho, rho)
+
+
+def client_patch(scan: Scan, coded: Coded) -> StepArray:
+    """The dense range a client makes of a refinement, voids included. (rows, columns) uint16."""
+    patch = _patch(scan, coded.selection, coded.quality)
+    patch[void_cells(scan, coded.selection)] = VOID
+    return patch
+
+
+def note_range(scan: Scan, state: ClientState, coded: Coded) -> None:
+    """Record a range refinement in a client's state: holdings, digest and the error left in its blocks."""
+    coded.note(state)
+    patch = client_patch(scan, coded)
+    selection = coded.selection
+    state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
+    left = block_errors(patch, np.asarray(cut(scan.range_steps, selection)))
+    rows, columns = np.nonzero(selection.adopted)
+    state.error[selection.y.block[rows], selection.x.block[columns]] = left[rows, columns]
+
+
+class _Trial:
+    """One spacing over a region: what error a quantum leaves."""
+
+    def __init__(self, scan: Scan, selection: Selection, region: Region) -> None:
+        self._selection = selection
+        self._samples = range_samples(scan, selection)
+        top, left = region.top - selection.y.start, (region.left - selection.x.start) % region.turn
+        columns = (left + np.arange(region.width)) % region.turn
+        self._place = np.ix_(np.arange(top, top + region.height), columns)
+        truth = scan.range_steps[region.rows][:, region.columns]
+        self._measured = truth != VOID
+        self._truth = truth[self._measured].astype(np.int32)
+        self._known: dict[int, float] = {}
+
+    def error(self, quantum: int) -> float:
+        """99th percentile ("higher") of the error over measured cells of the region. [steps]"""
+        if quantum not in self._known:
+            self._known[quantum] = self._measure(quantum)
+        return self._known[quantum]
+
+    def _measure(self, quantum: int) -> float:
+        if not self._truth.size:
+            return 0.0
+        samples = dequantise(quantise(self._samples, quantum), quantum)
+        patch = range_patch(self._selection, samples)[self._place]
+        return percentile_higher(np.abs(patch[self._measured].astype(np.int32) - self._truth), PERCENTILE)
+
+
+def percentile_higher(values: np.ndarray, percent: float) -> float:
+    """Percentile of a non-empty array, the next higher value where it falls between two."""
+    return float(np.percentile(values, percent, method="higher"))
+
+
+def _patch(scan: Scan, selection: Selection, quantum: int) -> StepArray:
+    return range_patch(selection, dequantise(quantise(range_samples(scan, selection), quantum), quantum))
+
+
+def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:
+    """Smallest quantum held in the blocks that the lattice would make finer."""
+    where = np.ix_(lattice.y.block, lattice.x.block)
+    improves = lattice.listed & (lattice.level < held.level[where])
+    return 65535 - int(held.rank[where][improves].max(initial=COARSE_RANK))
+
+
+def _trial_selection(fresh: ChannelHoldings, region: Region, p: int) -> Selection | None:
+    if 2 * fresh.shape.width % (2 * p):
+        return None
+    parameters = Parameters(2 * p, *region.blocks(8))
+    found = select(build_lattice(fresh.shape, parameters), fresh, range_rank(1))
+    return found[0] if found else None
+
+
+def _largest_quantum(trial: _Trial, target_steps: float) -> int:
+    """Largest quantum that keeps the region's error within target_steps, to a twentieth."""
+    low, high = 1, min(max(int(2.5 * target_steps), 1), QUANTUM_MAX)
+    while high - low > max(low // 20, 0) and high > low:
+        middle = (low + high + 1) // 2
+        if trial.error(middle) <= target_steps:
+            low = middle
+        else:
+            high = middle - 1
+    return low

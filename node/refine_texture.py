@@ -1,0 +1,135 @@
+"""Texture for a look: which spacing and quality reach the PSNR asked for, and the refinement that carries them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from node.coded import Coded, rho_of
+from node.library import Scan
+from node.sample import texture_samples
+from node.state import ClientState
+from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
+from protocol.grid import ImageArray
+from protocol.holdings import ChannelHoldings, texture_rank
+from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice
+from protocol.messages import TextureParameters
+from protocol.reconstruct import Selection, select, texture_patch
+from protocol.region import Region
+
+CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
+SPACINGS = (8, 6, 4, 3, 2, 1.5, 1)
+SKIRT_S = 1.0
+SHARE_OF_ERROR = 0.5  # of the squared error allowed, what the spacing may take; the codec has the rest
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A spacing, and the squared error per value it leaves in the region before any coding."""
+
+    p: float
+    mse: float
+
+
+def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: float) -> Choice:
+    """The widest plateau spacing that leaves the codec enough of the error allowed in the region."""
+    shape = state.shapes[Channel.TEXTURE]
+    allowed = mse_of_db(target_db) * SHARE_OF_ERROR
+    for p in SPACINGS[:-1]:
+        selection = _whole(shape, region, p)
+        if selection is None:
+            continue
+        mse = region_mse(scan, selection, region, texture_samples(scan, selection))
+        if mse <= allowed:
+            return Choice(p, mse)
+    return Choice(1, 0.0)
+
+
+def code_texture(scan: Scan, state: ClientState, region: Region, wanted: TextureParameters) -> Coded | None:
+    """Encode a refinement of the region's blocks, or None when the client holds all of it already.
+
+    Where a block that would become finer is held at a better quality, the whole refinement takes that one (F-09c).
+    Raises LatticeError for a spacing that does not fit, CodecError for a quality the codec does not have.
+    """
+    held = state.holdings.channels[Channel.TEXTURE]
+    lattice = build_lattice(held.shape, texture_lattice(region, wanted))
+    quality = max(wanted.quality, _best_held(held, lattice))
+    found = select(lattice, held, texture_rank(quality))
+    if found is None:
+        return None
+    codec = CODECS[wanted.codec]
+    if quality != wanted.quality and quality > quality_bounds(wanted.codec)[1]:
+        codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
+    payload = encode_texture(texture_samples(scan, found[0]), codec, quality)
+    return Coded(*found, texture_rank(quality), quality, codec, payload)
+
+
+def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:
+    """The lattice of a region's blocks."""
+    rho = rho_of(wanted.s)
+    return Parameters(round(2 * wanted.p), *region.blocks(16), rho, rho)
+
+
+def coded_mse(scan: Scan, coded: Coded, region: Region) -> float:
+    """Squared error per value that a refinement leaves in the part of the region it adopts."""
+    shape = coded.selection.sample_shape
+    texels = decode_texture(coded.payload, TextureCodec(coded.codec), coded.quality, shape)
+    return region_mse(scan, coded.selection, region, texels)
+
+
+def region_mse(scan: Scan, selection: Selection, region: Region, texels: ImageArray) -> float:
+    """Squared error per value over the region's texels inside the selection, from its (decoded) samples."""
+    patch = texture_patch(selection, texels)
+    total, count = 0.0, 0
+    for rows, columns, source in selection.spans():
+        for inside in _overlaps(region, columns):
+            top, bottom = max(rows.start, region.top), min(rows.stop, region.top + region.height)
+            if top >= bottom:
+                continue
+            offset = source.start - columns.start
+            made = patch[top - rows.start : bottom - rows.start, inside.start + offset : inside.stop + offset]
+            total += cv2.norm(np.ascontiguousarray(made), np.ascontiguousarray(scan.texture[top:bottom, inside]), cv2.NORM_L2SQR)
+            count += made.size
+    return total / count if count else 0.0
+
+
+def mse_of_db(db: float) -> float:
+    """Squared error per value of a PSNR over 8 bits."""
+    return float(255.0**2 / 10 ** (db / 10))
+
+
+def db_of_mse(mse: float) -> float:
+    """PSNR over 8 bits of a squared error per value; 100 where there is none."""
+    return min(float(10 * np.log10(255.0**2 / mse)), 100.0) if mse > 0 else 100.0
+
+
+def quality_bounds(codec: str) -> tuple[int, int]:
+    """Lowest and highest lossy quality of a codec."""
+    return (JPEG_QUALITY_MIN, JPEG_QUALITY_MAX) if codec == "jpeg" else (0, LOSSY_MAX)
+
+
+def _overlaps(region: Region, columns: slice) -> Iterator[slice]:
+    """The parts of a run of columns (not wrapped) that lie in the region."""
+    for turn in (-region.turn, 0, region.turn):
+        start, stop = max(columns.start, region.left + turn), min(columns.stop, region.left + region.width + turn)
+        if start < stop:
+            yield slice(start, stop)
+
+
+def _whole(shape: ChannelShape, region: Region, p: float) -> Selection | None:
+    parameters = texture_lattice(region, TextureParameters(p=p, s=SKIRT_S))
+    if parameters.blocks_wide == shape.blocks[1] and 2 * shape.width % parameters.half_spacing:
+        return None
+    fresh = ChannelHoldings.coarse(shape)
+    found = select(build_lattice(shape, parameters), fresh, texture_rank(0))
+    return found[0] if found else None
+
+
+def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:
+    """Best quality held in the blocks that the lattice would make finer; 0 where nothing is."""
+    where = np.ix_(lattice.y.block, lattice.x.block)
+    improves = lattice.listed & (lattice.level < held.level[where])
+    return max(int(held.rank[where][improves].max(initial=0)) - 1, 0)

@@ -1,0 +1,125 @@
+"""The values a refinement carries, gathered from a scan: the node's half of protocol.reconstruct.
+
+Range values are point samples of the scan, voids filled. Texture values are averages over cells; at spacing 1 a cell is
+a texel. Source: REQUIREMENTS F-07b.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from node.library import Scan
+from protocol.grid import VOID, BoolArray, ImageArray, IntArray, StepArray
+from protocol.lattice import Axis
+from protocol.reconstruct import Selection, cut
+
+
+def range_samples(scan: Scan, selection: Selection) -> StepArray:
+    """Filled range at the transmitted positions. sample_shape uint16."""
+    lattice = selection.lattice
+    rows = lattice.y.border[selection.y.sample] // 2
+    columns = lattice.x.border[selection.x.sample] // 2 % scan.spec.width
+    return np.asarray(scan.filled[rows][:, columns])
+
+
+def void_cells(scan: Scan, selection: Selection) -> BoolArray:
+    """Which cells of the selection's rectangle are adopted and void. (rows, columns) bool."""
+    void = np.asarray(cut(scan.range_steps, selection)) == VOID
+    return void & selection.adopted_cells() if not selection.adopted.all() else void
+
+
+def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
+    """Mean colour of each transmitted cell. sample_shape + (3,) uint8."""
+    lattice = selection.lattice
+    y, x = _Cells(lattice.y, selection.y.sample), _Cells(lattice.x, selection.x.sample)
+    spacing = lattice.parameters.half_spacing
+    texels = np.empty((*(axis.border.size - 1 for axis in (y, x)), 3), np.uint8)
+    core_y, core_x = y.plateau(spacing), x.plateau(spacing)
+    texels[core_y, core_x] = _plateau_means(scan, y.border[core_y.start : core_y.stop + 1], x.border[core_x.start : core_x.stop + 1], spacing)
+    for rows in (slice(0, core_y.start), slice(core_y.stop, texels.shape[0])):
+        _fill_skirt(scan, texels, y, x, rows, slice(0, texels.shape[1]))
+    for columns in (slice(0, core_x.start), slice(core_x.stop, texels.shape[1])):
+        _fill_skirt(scan, texels, y, x, core_y, columns)
+    return texels[np.ix_(y.wanted, x.wanted)]
+
+
+class _Cells:
+    """The run of one axis' cells round the wanted ones. border (n + 1,) in half texels; wanted: indices into the run."""
+
+    def __init__(self, axis: Axis, sample: IntArray) -> None:
+        self.border = axis.border[sample[0] : sample[-1] + 2]
+        self.wanted = sample - sample[0]
+
+    def plateau(self, half_spacing: int) -> slice:
+        """The longest run of cells as wide as the plateau's."""
+        same = np.concatenate([[False], np.diff(self.border) == half_spacing, [False]])
+        edges = np.flatnonzero(np.diff(same.astype(np.int8)))
+        if not edges.size:
+            return slice(0, 0)
+        starts, stops = edges[::2], edges[1::2]
+        longest = int(np.argmax(stops - starts))
+        return slice(int(starts[longest]), int(stops[longest]))
+
+
+def _plateau_means(scan: Scan, y: IntArray, x: IntArray, half_spacing: int) -> ImageArray:
+    """Means over equal cells whose borders (half texels) are given. (len(y) - 1, len(x) - 1, 3) uint8."""
+    rows, columns = y.size - 1, x.size - 1
+    if rows < 1 or columns < 1:
+        return np.empty((max(rows, 0), max(columns, 0), 3), np.uint8)
+    step = half_spacing // 2
+    if half_spacing in (2, 4, 8, 16) and not (y[0] % half_spacing or x[0] % half_spacing or scan.spec.texture_width % step):
+        level = scan.pyramid[step.bit_length() - 1] if step.bit_length() <= len(scan.pyramid) else None
+        if level is not None and y[-1] <= 2 * scan.spec.texture_height:
+            return _crop(level, int(y[0]) // half_spacing, rows, int(x[0]) // half_spacing, columns)
+    even_rows, even_columns = rows + rows % 2, columns + columns % 2  # so that cells of 1.5 texels end on whole ones
+    source = _crop(
+        scan.texture, int(y[0]) // 2, even_rows * half_spacing // 2, int(x[0]) // 2, even_columns * half_spacing // 2
+    )
+    return np.asarray(cv2.resize(source, (even_columns, even_rows), interpolation=cv2.INTER_AREA)[:rows, :columns])
+
+
+def _fill_skirt(scan: Scan, texels: ImageArray, y: _Cells, x: _Cells, rows: slice, columns: slice) -> None:
+    """Mean colour of the cells in a strip, the narrow direction first. Half-texel borders are taken as whole ones."""
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        return
+    y_border = y.border[rows.start : rows.stop + 1] // 2
+    x_border = x.border[columns.start : columns.stop + 1] // 2
+    height, width = int(y_border[-1] - y_border[0]), int(x_border[-1] - x_border[0])
+    source = _crop(scan.texture, int(y_border[0]), height, int(x_border[0]), width)
+    if rows.stop - rows.start <= columns.stop - columns.start:
+        strip = _column_means(_row_means(source, y_border - y_border[0]), x_border - x_border[0])
+    else:
+        strip = _row_means(_column_means(source, x_border - x_border[0]), y_border - y_border[0])
+    texels[rows, columns] = strip
+
+
+def _row_means(image: ImageArray, border: IntArray) -> ImageArray:
+    """Mean of each run of rows between whole borders. (len(border) - 1, columns, 3) uint8."""
+    counts = np.diff(border)
+    if np.all(counts == 1):
+        return image
+    sums = np.add.reduceat(image, border[:-1], axis=0, dtype=np.uint32)
+    counts = counts.astype(np.uint32)[:, None, None]
+    return ((2 * sums + counts) // (2 * counts)).astype(np.uint8)
+
+
+def _column_means(image: ImageArray, border: IntArray) -> ImageArray:
+    return np.swapaxes(_row_means(np.swapaxes(image, 0, 1), border), 0, 1)
+
+
+def _crop(image: ImageArray, top: int, height: int, left: int, width: int) -> ImageArray:
+    """A rectangle of an image, cyclic in x; below the last row that row goes on. (height, width, 3) uint8."""
+    rows, columns = image.shape[:2]
+    left %= columns
+    if top + height > rows:
+        image = image[np.minimum(np.arange(top, top + height), rows - 1)]
+        top = 0
+    if left + width <= columns:
+        return image[top : top + height, left : left + width]
+    parts = [image[top : top + height, left:]]
+    width -= columns - left
+    while width > 0:
+        parts.append(image[top : top + height, : min(width, columns)])
+        width -= columns
+    return np.concatenate(parts, axis=1)
