@@ -1,0 +1,277 @@
+import json
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from node import library as library_module
+from node.coarse import build_coarse, fill_voids
+from node.library import About, Library, content_id
+from protocol.errors import LibraryError
+from protocol.grid import Grid, GridSpec
+
+SPEC = GridSpec(24, 16, 64, 48, step_mm=0.05, pitch_mm=1.0, z_max_mm=12.5, theta0_rad=0.25)
+ABOUT = About(1e9, "sweep", "head")
+
+
+def _grid(seed: int, spec: GridSpec = SPEC) -> Grid:
+    rng = np.random.default_rng(seed)
+    range_steps = rng.integers(0, 3, (spec.height, spec.width)).astype(np.uint16)
+    texture = rng.integers(0, 256, (spec.texture_height, spec.texture_width, 3)).astype(np.uint8)
+    return Grid(spec, range_steps, texture)
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_kept_scan_is_the_same_after_a_restart(tmp_path: Path) -> None:
+    grid = _grid(0)
+    added = Library(tmp_path / "new" / "library").add(grid, ABOUT)
+    opened = Library(tmp_path / "new" / "library").open(added.id)
+    for scan in (added, opened):
+        assert (scan.id, scan.spec, scan.about) == (content_id(grid), SPEC, ABOUT)
+        assert np.array_equal(scan.range_steps, grid.range_steps)
+        assert np.array_equal(scan.texture, grid.texture)
+        assert np.array_equal(scan.filled, fill_voids(grid.range_steps))
+        assert np.array_equal(scan.coarse.range_steps, build_coarse(grid).range_steps)
+        assert np.array_equal(scan.coarse.texture, build_coarse(grid).texture)
+        assert [level.shape[:2] for level in scan.pyramid] == [(48, 64), (24, 32), (12, 16)]
+
+
+def test_samples_of_a_scan_are_mapped_and_everything_is_read_only(tmp_path: Path) -> None:
+    scan = Library(tmp_path).add(_grid(0), ABOUT)
+    assert isinstance(scan.range_steps, np.memmap) and isinstance(scan.texture, np.memmap)
+    steps = [scan.range_steps, scan.filled, scan.coarse.range_steps, scan.coarse.filled]
+    images = [scan.texture, scan.coarse.texture, *scan.pyramid]
+    assert not any(array.flags.writeable for array in steps)
+    assert not any(array.flags.writeable for array in images)
+
+
+def test_the_id_tells_any_change_of_samples_or_geometry() -> None:
+    grid = _grid(0)
+    other_range, other_texture = grid.range_steps.copy(), grid.texture.copy()
+    other_range[3, 4] ^= 1
+    other_texture[5, 6, 2] ^= 1
+    other_spec = GridSpec(24, 16, 64, 48, step_mm=0.05, pitch_mm=1.0, z_max_mm=12.5, theta0_rad=0.5)
+    grids = [
+        grid,
+        Grid(SPEC, other_range, grid.texture),
+        Grid(SPEC, grid.range_steps, other_texture),
+        Grid(other_spec, grid.range_steps, grid.texture),
+    ]
+    assert len({content_id(g) for g in grids}) == 4
+    assert content_id(Grid(SPEC, np.asfortranarray(grid.range_steps), grid.texture)) == content_id(grid)
+
+
+def test_scans_are_listed_newest_first_whatever_the_clock_said(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    ids = [library.add(_grid(seed), About(1e9 - 1000 * seed)).id for seed in range(3)]
+    library = Library(tmp_path)
+    ids.append(library.add(_grid(3), About(0.0)).id)
+    for current in (library, Library(tmp_path)):
+        assert [summary.id for summary in current.scans()] == ids[::-1]
+        assert [summary.sequence for summary in current.scans()] == [4, 3, 2, 1]
+
+
+def test_the_same_content_again_is_the_same_scan_and_the_newest(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    first = library.add(_grid(0), ABOUT)
+    library.add(_grid(1), ABOUT)
+    again = library.add(_grid(0), About(2e9, name="again"))
+    assert again.id == first.id
+    assert again.range_steps is first.range_steps
+    for current in (library, Library(tmp_path)):
+        assert [summary.about.name for summary in current.scans()] == ["again", "head"]
+        assert current.open(first.id).about == About(2e9, name="again")
+        assert current.problems == ()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_listing_reads_no_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Library(tmp_path).add(_grid(0), ABOUT)
+    opened: list[str] = []
+    really_open = open
+
+    def noted_open(path: Path, mode: str = "r") -> object:
+        opened.append(Path(path).name)
+        return really_open(path, mode)
+
+    monkeypatch.setattr(library_module, "open", noted_open, raising=False)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("samples were read"))
+    assert len(Library(tmp_path).scans()) == 1
+    assert opened == ["scan.json"]
+
+
+@pytest.mark.parametrize("scan_id", ["", "0" * 32, "../library", "x" * 10_000, "\0"])
+def test_an_unknown_scan_is_refused(tmp_path: Path, scan_id: str) -> None:
+    with pytest.raises(LibraryError, match="no scan .{0,60} in this library"):
+        Library(tmp_path).open(scan_id)
+
+
+def _cut_range(folder: Path) -> None:
+    (folder / "range.npy").write_bytes((folder / "range.npy").read_bytes()[:-300])
+
+
+def _lose_texture(folder: Path) -> None:
+    (folder / "texture.npy").unlink()
+
+
+def _lose_record(folder: Path) -> None:
+    (folder / "scan.json").unlink()
+
+
+def _garble_record(folder: Path) -> None:
+    (folder / "scan.json").write_bytes(b'{"format": 1, \xff')
+
+
+def _bloat_record(folder: Path) -> None:
+    (folder / "scan.json").write_bytes(b" " * 70_000)
+
+
+def _edit_record(folder: Path, **fields: object) -> None:
+    record = json.loads((folder / "scan.json").read_bytes())
+    (folder / "scan.json").write_text(json.dumps(record | fields))
+
+
+def _write_as_newer(folder: Path) -> None:
+    _edit_record(folder, format=2, surprise=True)
+
+
+def _claim_another_id(folder: Path) -> None:
+    _edit_record(folder, id="0" * 32)
+
+
+def _claim_a_width_of_0(folder: Path) -> None:
+    spec = json.loads((folder / "scan.json").read_bytes())["spec"]
+    _edit_record(folder, spec=spec | {"width": 0})
+
+
+def _rename_folder(folder: Path) -> None:
+    folder.rename(folder.with_name("copy of it"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (_cut_range, "range.npy has the wrong size"),
+        (_lose_texture, "texture.npy cannot be read: No such file"),
+        (_lose_record, "scan.json cannot be read: No such file"),
+        (_garble_record, "scan.json is damaged"),
+        (_bloat_record, "scan.json is larger than 65536 bytes"),
+        (_write_as_newer, "written in a format that this version does not know"),
+        (_claim_another_id, "scan.json belongs to scan '000"),
+        (_claim_a_width_of_0, "width must be between"),
+        (_rename_folder, "not a scan"),
+    ],
+)
+def test_a_damaged_folder_is_reported_left_alone_and_disturbs_nothing(
+    tmp_path: Path, damage: Callable[[Path], None], reason: str
+) -> None:
+    library = Library(tmp_path)
+    sound, hurt = library.add(_grid(0), ABOUT), library.add(_grid(1), ABOUT)
+    damage(tmp_path / hurt.id)
+    before = _files(tmp_path)
+    library = Library(tmp_path)
+    assert [summary.id for summary in library.scans()] == [sound.id]
+    assert [reason in problem.reason for problem in library.problems] == [True]
+    with pytest.raises(LibraryError, match="no scan"):
+        library.open(hurt.id)
+    assert library.open(sound.id).id == sound.id
+    assert _files(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("file", "offset"), [("range.npy", -1), ("texture.npy", -1), ("range.npy", 0), ("texture.npy", 20)]
+)
+def test_a_rotten_byte_is_found_when_the_scan_is_opened(tmp_path: Path, file: str, offset: int) -> None:
+    library = Library(tmp_path)
+    scan_id = library.add(_grid(0), ABOUT).id
+    path = tmp_path / scan_id / file
+    data = bytearray(path.read_bytes())
+    data[offset] ^= 1
+    path.write_bytes(data)
+    library = Library(tmp_path)
+    with pytest.raises(LibraryError, match="is damaged"):
+        library.open(scan_id)
+    assert [problem.name for problem in library.problems] == [scan_id]
+    assert library.scans() == []
+    with pytest.raises(LibraryError, match="cannot keep scan"):
+        library.add(_grid(0), ABOUT)
+    assert path.read_bytes() == data
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_foreign_things_and_unfinished_scans_are_reported(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "holiday").mkdir()
+    (tmp_path / ".incoming-x1").mkdir()
+    (tmp_path / ("a" * 32)).write_text("a file with the name of a scan")
+    reasons = {problem.name: problem.reason for problem in Library(tmp_path).problems}
+    assert set(reasons) == {"notes.txt", "holiday", ".incoming-x1", "a" * 32}
+    assert "never completely written" in reasons.pop(".incoming-x1")
+    assert set(reasons.values()) == {"not a scan"}
+
+
+def test_a_scan_that_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = Library(tmp_path)
+
+    def full_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for name in ("fsync", "rename"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, full_disk)
+            with pytest.raises(LibraryError, match="No space left on device"):
+                library.add(_grid(0), ABOUT)
+        assert list(tmp_path.iterdir()) == []
+        assert library.scans() == []
+    assert library.add(_grid(0), ABOUT).id == library.scans()[0].id
+
+
+def test_a_library_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "library").write_text("")
+    with pytest.raises(LibraryError, match="cannot be used"):
+        Library(tmp_path / "library")
+
+
+def test_scans_used_last_stay_open(tmp_path: Path) -> None:
+    library = Library(tmp_path, open_max=2)
+    a, b = library.add(_grid(0), ABOUT), library.add(_grid(1), ABOUT)
+    assert library.open(a.id) is a
+    library.add(_grid(2), ABOUT)
+    assert library.open(a.id) is a
+    assert library.open(b.id) is not b
+
+
+def test_threads_that_open_one_scan_share_it(tmp_path: Path) -> None:
+    scan_id = Library(tmp_path).add(_grid(0), ABOUT).id
+    library, start = Library(tmp_path), threading.Barrier(4)
+    opened: list[object] = []
+
+    def open_it() -> None:
+        start.wait()
+        opened.append(library.open(scan_id))
+
+    threads = [threading.Thread(target=open_it) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(opened) == 4
+    assert len({id(scan) for scan in opened}) == 1
+
+
+def test_first_views_are_as_large_as_the_library_allows(tmp_path: Path) -> None:
+    small = Library(tmp_path, first_view_bytes=64).add(_grid(0), ABOUT)
+    assert small.coarse.texture.shape == (6, 8, 3)
+    assert len(small.pyramid) == 4
+
+
+@pytest.mark.parametrize("about", [{"created_unix_s": float("nan")}, {"created_unix_s": 0.0, "name": "x" * 201}])
+def test_an_about_out_of_bounds_is_refused(about: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be finite|at most 200"):
+        About(**about)  # type: ignore[arg-type]
