@@ -1,0 +1,222 @@
+"""The dense model of a scan: filled by the first view, made finer by refinements, never coarser.
+
+Source: REQUIREMENTS F-09c, F-11.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.errors import HoldingsDiffer
+from client.export import write_grid
+from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, decode_texture
+from protocol.errors import CodecError, LatticeError, RemoteWireError
+from protocol.grid import VOID, BoolArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
+from protocol.holdings import ChannelHoldings, Holdings, range_rank, texture_rank
+from protocol.lattice import Channel, Parameters, build_lattice
+from protocol.messages import ScanInfo, Statement
+from protocol.reconstruct import (
+    Selection,
+    coarse_to_range,
+    coarse_to_texture,
+    content_hashes,
+    dequantise,
+    paste,
+    range_patch,
+    select,
+    texture_patch,
+)
+from protocol.refinement import Generator, Refinement
+
+
+Codec = TypeVar("Codec", RangeCodec, TextureCodec)
+Array = TypeVar("Array", NDArray[np.float32], StepArray, ImageArray)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Applied:
+    """What one refinement did. blocks : (n,) int64 flat indices of the dense blocks it overwrote."""
+
+    blocks: IntArray
+    apply_s: float
+
+
+class Model:
+    """Dense state of one scan. Read what it offers at any time; it changes while a look is in the air.
+
+    info : what the node says of the scan.    spec : its geometry.    holdings : what both ends agree we have.
+    """
+
+    def __init__(self, info: ScanInfo) -> None:
+        self.info = info
+        self.spec = info.spec()
+        self.shapes = info.shapes()
+        self.holdings = Holdings.coarse(self.shapes)
+        self._dense: dict[Channel, StepArray | ImageArray] = {}
+        self._range_mm: NDArray[np.float32] | None = None
+        self._spacing: NDArray[np.float32] | None = None
+
+    @property
+    def complete(self) -> bool:
+        """The first view of both channels is in."""
+        return len(self._dense) == len(Channel)
+
+    @property
+    def range_steps(self) -> StepArray:
+        """Range in whole steps, 0 = void. (H, W) uint16, a read-only view that follows later refinements."""
+        return self._view(Channel.RANGE)  # type: ignore[return-value]
+
+    @property
+    def range_mm(self) -> NDArray[np.float32]:
+        """Distance from the axis, NaN = void. (H, W) float32 [mm], read-only, as of now."""
+        if self._range_mm is None:
+            self._range_mm = _read_only(steps_to_mm(self.range_steps, self.spec.step_mm))
+        return self._range_mm
+
+    @property
+    def texture(self) -> ImageArray:
+        """Colour. (Ht, Wt, 3) uint8 RGB, a read-only view that follows later refinements."""
+        return self._view(Channel.TEXTURE)  # type: ignore[return-value]
+
+    @property
+    def spacing(self) -> NDArray[np.float32]:
+        """Sample spacing held at each range cell, 2^(level / 2). (H, W) float32 [columns], read-only, as of now."""
+        if self._spacing is None:
+            self._spacing = _read_only(spacing_of_levels(self.holdings.channels[Channel.RANGE]))
+        return self._spacing
+
+    @property
+    def grid(self) -> Grid:
+        """The model as a grid, over the same read-only views."""
+        return Grid(self.spec, self.range_steps, self.texture)
+
+    def export(self, path: str | Path) -> None:
+        """Write the model to a file in the format its suffix names (.npz). Raises ExportError."""
+        write_grid(self.grid, path)
+
+    def statement(self) -> Statement:
+        """Its holdings as they travel."""
+        return Statement(*(self.holdings.channels[channel].to_runs() for channel in Channel))
+
+    def apply(self, refinement: Refinement) -> Applied:
+        """Take in one refinement. The caller keeps them in order, one at a time.
+
+        Raises HoldingsDiffer when it was planned over other holdings than ours, RemoteWireError when it makes no sense;
+        the model is then unchanged.
+        """
+        started_s = time.perf_counter()
+        try:
+            coarse = refinement.generator is Generator.COARSE
+            blocks = self._apply_first_view(refinement) if coarse else self._apply_fovea(refinement)
+        except (CodecError, LatticeError) as error:
+            raise RemoteWireError(f"refinement {refinement.seq} of {refinement.channel.name.lower()}: {error}") from error
+        return Applied(blocks, time.perf_counter() - started_s)
+
+    def _apply_first_view(self, refinement: Refinement) -> IntArray:
+        channel = refinement.channel
+        if channel in self._dense:
+            raise RemoteWireError(f"a second first view of {channel.name.lower()}")
+        shape = self.shapes[channel]
+        samples = self._decode(refinement, (shape.coarse_height, shape.coarse_width))
+        if channel is Channel.RANGE:
+            coarse = dequantise(samples, refinement.quality)
+            coarse[decode_mask(refinement.mask, coarse.shape)] = VOID
+            self._dense[channel] = coarse_to_range(coarse, shape)
+        else:
+            self._dense[channel] = coarse_to_texture(samples, shape)
+        self._range_mm = None
+        return np.arange(shape.blocks[0] * shape.blocks[1])
+
+    def _apply_fovea(self, refinement: Refinement) -> IntArray:
+        if not self.complete:
+            raise RemoteWireError("a fovea before the first view")
+        channel, parameters = refinement.channel, refinement.parameters
+        assert parameters is not None  # Refinement.from_bytes sees to it
+        held = self.holdings.channels[channel]
+        rank = _rank(refinement)
+        selection, adopted = self._select(refinement, parameters, rank)
+        patch = self._patch(refinement, selection)
+        if refinement.self_contained:
+            selection, adopted = _only_finer(selection, adopted, held, rank)
+        paste(self._dense[channel], patch, selection)
+        held.adopt(selection.lattice, adopted, rank)
+        blocks = selection.adopted_blocks()
+        if channel is Channel.RANGE:
+            self.holdings.add_content(blocks, content_hashes(patch, selection))
+            self._range_mm = self._spacing = None
+        return blocks
+
+    def _select(self, refinement: Refinement, parameters: Parameters, rank: int) -> tuple[Selection, BoolArray]:
+        """Which samples these are, from the same parameters and holdings as the node had."""
+        shape = self.shapes[refinement.channel]
+        held = self.holdings.channels[refinement.channel]
+        planned_over = ChannelHoldings.coarse(shape) if refinement.self_contained else held
+        chosen = select(build_lattice(shape, parameters), planned_over, rank)
+        expected = chosen[0].samples if chosen else 0
+        if chosen is None or expected != refinement.samples:
+            raise HoldingsDiffer(f"refinement {refinement.seq} carries {refinement.samples} samples, not {expected}")
+        return chosen
+
+    def _patch(self, refinement: Refinement, selection: Selection) -> StepArray | ImageArray:
+        """Dense samples of the selection's rectangle, voids applied."""
+        samples = self._decode(refinement, selection.sample_shape)
+        if refinement.channel is Channel.TEXTURE:
+            return texture_patch(selection, samples)
+        patch = range_patch(selection, dequantise(samples, refinement.quality))
+        if refinement.mask:
+            patch[decode_mask(refinement.mask, patch.shape)] = VOID
+        return patch
+
+    def _decode(self, refinement: Refinement, shape: tuple[int, int]) -> StepArray | ImageArray:
+        if refinement.samples != shape[0] * shape[1]:
+            raise RemoteWireError(f"refinement {refinement.seq} carries {refinement.samples} samples, not {shape}")
+        if refinement.channel is Channel.RANGE:
+            _rank(refinement)
+            return decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape)
+        if refinement.mask:
+            raise RemoteWireError("texture has no voids of its own")
+        codec = _codec(TextureCodec, refinement.codec)
+        return decode_texture(refinement.payload, codec, refinement.quality, shape)
+
+    def _view(self, channel: Channel) -> StepArray | ImageArray:
+        return _read_only(self._dense[channel].view())
+
+
+def spacing_of_levels(held: ChannelHoldings) -> NDArray[np.float32]:
+    """Sample spacing of each cell from the level of its block: 2^(level / 2). (height, width) float32 [samples]"""
+    spacing = np.exp2(held.level / np.float32(2), dtype=np.float32)
+    side, shape = held.shape.block, held.shape
+    return np.repeat(np.repeat(spacing, side, axis=0)[: shape.height], side, axis=1)[:, : shape.width]
+
+
+def _rank(refinement: Refinement) -> int:
+    rank_of = range_rank if refinement.channel is Channel.RANGE else texture_rank
+    return rank_of(refinement.quality)
+
+
+def _codec(kind: type[Codec], number: int) -> Codec:
+    try:
+        return kind(number)
+    except ValueError:
+        raise CodecError(f"no codec {number}") from None
+
+
+def _only_finer(
+    selection: Selection, adopted: BoolArray, held: ChannelHoldings, rank: int
+) -> tuple[Selection, BoolArray]:
+    """Of a selection planned over the first view alone, the blocks that make what we hold finer (F-09c)."""
+    rows, columns = np.flatnonzero(adopted.any(1)), np.flatnonzero(adopted.any(0))
+    finer = adopted & held.adoptable(selection.lattice, rank)
+    core = finer[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return replace(selection, adopted=core), finer
+
+
+def _read_only(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,118 @@
+"""The WebSocket to a node: messages and refinements in and out, every failure of the carrier as one of our errors."""
+
+from __future__ import annotations
+
+import asyncio
+
+import aiohttp
+from aiohttp import ClientWebSocketResponse, ClientWSTimeout, WSCloseCode, WSMsgType
+
+from client.errors import NodeLost, RequestRefused
+from protocol import messages as m
+from protocol.errors import RemoteWireError
+from protocol.refinement import CRC, HEADER, MASK_MAX, PARAMETERS_MAX, PAYLOAD_MAX, Refinement
+from protocol.session import Role
+from protocol.session import Session as Order
+
+PATH = "/v1/stream"
+MESSAGE_MAX_BYTES = HEADER.size + PARAMETERS_MAX + MASK_MAX + PAYLOAD_MAX + CRC.size
+HANDSHAKE_S = 10
+HEARTBEAT_S = 15
+CLOSE_S = 2
+CLOSE_REASON_MAX_BYTES = 120
+
+
+class Stream:
+    """One open WebSocket. bytes_sent, bytes_received : of its messages."""
+
+    def __init__(self, socket: ClientWebSocketResponse, url: str) -> None:
+        self.url = url
+        self.bytes_sent = 0
+        self.bytes_received = 0
+        self._socket = socket
+        self._order = Order(Role.CLIENT)
+
+    async def greet(self, token: str | None) -> m.ServerInfo:
+        """Exchange greetings. Raises NodeLost, RequestRefused, or RemoteWireError for a node of another protocol."""
+        info, _ = await self.receive()
+        assert isinstance(info, m.ServerInfo)  # the order of a stream allows nothing else here
+        if info.protocol != m.PROTOCOL:
+            raise RemoteWireError(f"{self.url} speaks {info.protocol}, we {m.PROTOCOL}: update the older of the two")
+        await self.send(m.Hello(m.PROTOCOL, client="foveascan", token=token or ""))
+        match await self.receive():
+            case m.Refused(code=code, message=message), _:
+                raise RequestRefused(code, message)
+            case m.Goodbye(reason=reason), _:
+                raise NodeLost(f"{self.url} ended the stream: {reason}")
+        return info
+
+    async def receive(self) -> tuple[m.Message | Refinement, int]:
+        """The next thing the node says, and its size in bytes. Raises NodeLost or RemoteWireError."""
+        message = await self._socket.receive()
+        if message.type not in (WSMsgType.TEXT, WSMsgType.BINARY):
+            raise self._ended(message.data if message.type is WSMsgType.ERROR else None)
+        data: str | bytes = message.data
+        size = len(data.encode()) if isinstance(data, str) else len(data)
+        self.bytes_received += size
+        return self._order.receive(data), size
+
+    async def send(self, message: m.FromClient) -> None:
+        """Say something; waits while the node reads slowly. Raises LocalWireError, NodeLost."""
+        text = str(self._order.send(message))
+        try:
+            await self._socket.send_str(text)
+        except (aiohttp.ClientError, OSError) as error:
+            raise NodeLost(f"lost {self.url}: {error}") from error
+        self.bytes_sent += len(text.encode())
+
+    async def close(self, violation: RemoteWireError | None = None) -> None:
+        """Close the stream; tell the node what it did wrong, if anything."""
+        code = WSCloseCode.PROTOCOL_ERROR if violation else WSCloseCode.OK
+        reason = str(violation or "").encode()[:CLOSE_REASON_MAX_BYTES].decode(errors="ignore").encode()
+        await self._socket.close(code=code, message=reason)
+
+    def _ended(self, cause: object) -> NodeLost | RemoteWireError:
+        if isinstance(cause, aiohttp.WebSocketError):
+            return RemoteWireError(f"{self.url} broke the WebSocket protocol: {cause}")
+        why = cause or f"the node closed the stream ({self._socket.close_code})"
+        return NodeLost(f"lost {self.url}: {why}; connect again once the node is back")
+
+
+async def open_stream(http: aiohttp.ClientSession, url: str, token: str | None) -> tuple[Stream, m.ServerInfo]:
+    """Connect to the node at `url` and exchange greetings. Raises NodeLost, RequestRefused, RemoteWireError."""
+    try:
+        async with asyncio.timeout(HANDSHAKE_S):
+            stream = Stream(await _connect(http, url), url)
+            try:
+                return stream, await stream.greet(token)
+            except RemoteWireError as violation:
+                await stream.close(violation)
+                raise
+    except TimeoutError as error:
+        raise NodeLost(f"{url} does not answer; check the address, or restart the node") from error
+
+
+async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResponse:
+    try:
+        socket = await http.ws_connect(
+            f"{url}{PATH}",
+            protocols=[m.PROTOCOL],
+            max_msg_size=MESSAGE_MAX_BYTES,
+            heartbeat=HEARTBEAT_S,
+            timeout=ClientWSTimeout(ws_close=CLOSE_S),
+        )
+    except (aiohttp.InvalidURL, ValueError) as error:
+        raise NodeLost(f"{url!r} is no address of a node; use http://HOST:PORT") from error
+    except aiohttp.WSServerHandshakeError as error:
+        raise _refusal(url, error.status) from error
+    except (aiohttp.ClientError, OSError) as error:
+        raise NodeLost(f"no node at {url} ({error}); start one with `foveascan serve`") from error
+    if socket.protocol != m.PROTOCOL:
+        raise RemoteWireError(f"{url} does not speak {m.PROTOCOL}: update the older of the two")
+    return socket
+
+
+def _refusal(url: str, status: int) -> NodeLost | RequestRefused:
+    if status in (401, 403):
+        return RequestRefused("forbidden", "it wants a token; pass the one it was paired with")
+    return NodeLost(f"{url} answers with HTTP {status}: it is no foveascan node, or a busy one")
