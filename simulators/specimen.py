@@ -17,6 +17,9 @@ import numpy as np
 from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from simulators import shapes
+from simulators.grid_file import read_grid
+from simulators.head import head
+from simulators.nutcracker import nutcracker
 
 SIZES: Mapping[str, shapes.Shape] = MappingProxyType(
     {
@@ -29,6 +32,8 @@ GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType
     {
         "sphere": shapes.sphere,
         "cylinder": shapes.cylinder,
+        "nutcracker": nutcracker,
+        "head": head,
     }
 )
 ON_COLUMN = 1e-6
@@ -68,17 +73,26 @@ class Specimen:
 def make_specimen(
     name_or_path: str | Path, size: str = "S", texture_path: str | Path | None = None, seed: int = 0
 ) -> Specimen:
-    """A generated specimen by name.
+    """A generated specimen by its name, or a grid from a file.
 
-    size : S, M or L.
-    Raises ConfigError for an unknown name or size.
+    size, seed : S, M or L, and what to draw from; for generated ones: a file has its own size.
+    texture_path : image of a file's texture (any format OpenCV reads); for files only.
+    Raises ConfigError for an unknown name, size or file format; OSError for a file that cannot be opened.
     """
-    generate = GENERATORS.get(str(name_or_path))
-    if generate is None:
-        raise ConfigError(f"specimen: {name_or_path} is none of {', '.join(GENERATORS)}")
     if size not in SIZES:
         raise ConfigError(f"size: {size} is none of {', '.join(SIZES)}")
+    generate = GENERATORS.get(str(name_or_path))
+    if generate is None:
+        return _from_file(Path(name_or_path), None if texture_path is None else Path(texture_path))
+    if texture_path is not None:
+        raise ConfigError(f"texture: {name_or_path} brings its own; --texture goes with a .npz file")
     return Specimen(str(name_or_path), generate(SIZES[size], seed))
+
+
+def _from_file(path: Path, texture_path: Path | None) -> Specimen:
+    if path.suffix != ".npz":
+        raise ConfigError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no .npz file")
+    return Specimen(*read_grid(path, texture_path))
 
 
 def _columns_about(angle_rad: float, theta0_rad: float, width: int) -> tuple[int, int, float]:

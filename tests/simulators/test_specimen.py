@@ -83,6 +83,22 @@ def test_every_specimen_has_the_named_shape_and_repeats_with_its_seed(name: str)
     assert not np.array_equal(one.texture, other.texture)
 
 
+@pytest.mark.parametrize("name", GENERATORS)
+def test_every_specimen_joins_at_the_seam(name: str) -> None:
+    grid = make_specimen(name).grid
+    for samples in (grid.range_steps.astype(np.int64), grid.texture.astype(np.int64)):
+        steps = np.abs(np.diff(np.concatenate([samples, samples[:, :1]], axis=1), axis=1)).mean(axis=0)
+        assert steps[-1].max() <= 3 * steps.mean() + 1
+
+
+@pytest.mark.parametrize("name", GENERATORS)
+def test_every_size_shows_the_same_object(name: str) -> None:
+    small, large = (make_specimen(name, size).grid for size in ("S", "M"))
+    inner = large.range_mm[5::10, 2::4][:100]
+    near = small.range_mm[: len(inner)]
+    assert np.nanmedian(np.abs(inner - near)) < 1.0
+
+
 @pytest.mark.parametrize(("name", "size", "message"), [("teapot", "S", "teapot"), ("sphere", "XL", "XL")])
 def test_unknown_names_and_sizes_are_refused(name: str, size: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
