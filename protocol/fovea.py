@@ -18,6 +18,8 @@ import numpy as np
 from protocol.errors import LatticeError
 from protocol.grid import FloatArray, IntArray
 
+RINGS_MAX = 64 * 1024 // 24 - 1  # so that a table stays below 64 KiB
+
 
 def radius_to_view(radius: FloatArray, alpha: float, s: float) -> FloatArray:
     """Distance in the source to distance in the foveated view. [samples, any shape]
@@ -131,9 +133,14 @@ class FoveaTable:
 
 @lru_cache(maxsize=64)
 def fovea_table(alpha: float, s: float, coarse_spacing: float, radius_max: float) -> FoveaTable:
-    """Build the table for (alpha, s), clipped by Eq. (12) and capped at radius_max."""
+    """Build the table for (alpha, s), clipped by Eq. (12) and capped at radius_max.
+
+    Raises LatticeError also where it would not stay below 64 KiB.
+    """
     last = clip_ring(alpha, s, coarse_spacing)
-    last = min(last, math.floor(float(radius_to_view(np.float64(radius_max), alpha, s)) + 1e-9))
+    last = min(last, math.floor(radius_to_view(np.array([radius_max]), alpha, s)[0] + 1e-9))
+    if last > RINGS_MAX:
+        raise LatticeError(f"alpha {alpha} and s {s} need {last} rings, more than {RINGS_MAX}")
     offset = np.minimum(view_to_radius(np.arange(last + 1, dtype=np.float64), alpha, s), radius_max)
     snapped = np.rint(offset).astype(np.int64)
     table = FoveaTable(offset, snapped, spacing_at(offset, alpha, s))

@@ -62,7 +62,8 @@ class ChannelHoldings:
         held_level, held_rank = self.level[where].astype(np.int64), self.rank[where].astype(np.int64)
         finer = (lattice.level < held_level) & (rank >= held_rank)
         better = (lattice.level == held_level) & (rank >= held_rank + RANK_MARGIN[self.shape.channel])
-        return lattice.listed & (finer | better) & (lattice.level < self.shape.coarse_level)
+        adopted: BoolArray = lattice.listed & (finer | better) & (lattice.level < self.shape.coarse_level)
+        return adopted
 
     def adopt(self, lattice: Lattice, adopted: BoolArray, rank: int) -> None:
         """Record that the blocks of `adopted` now hold the lattice's level at `rank`."""
@@ -80,7 +81,8 @@ class ChannelHoldings:
         key = self.level.ravel().astype(np.int64) << 16 | self.rank.ravel()
         starts = np.flatnonzero(np.diff(key, prepend=-1))
         counts = np.diff(np.append(starts, key.size))
-        return np.stack([counts, key[starts] >> 16, key[starts] & 0xFFFF], axis=1).tolist()
+        runs: list[list[int]] = np.stack([counts, key[starts] >> 16, key[starts] & 0xFFFF], axis=1).tolist()
+        return runs
 
     @classmethod
     def from_runs(cls, shape: ChannelShape, runs: list[list[int]]) -> ChannelHoldings:
@@ -151,4 +153,5 @@ def hash_blocks(cells: StepArray) -> HashArray:
 
     Sum over the block's cells of value times mix32(8 row + column + 1) | 1, modulo 2^32.
     """
-    return (cells.astype(np.uint32) * _WEIGHTS).sum(axis=(1, 2), dtype=np.uint32)
+    hashes: HashArray = (cells.astype(np.uint32) * _WEIGHTS).sum(axis=(1, 2), dtype=np.uint32)
+    return hashes

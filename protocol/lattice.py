@@ -115,7 +115,7 @@ class Axis:
 
     at : (m,) int64 strictly ascending positions, in quarter samples, not wrapped; ring ends and clamped edges included.
     sample : (m,) int64 which of the `count` transmitted samples stands there.
-    border : int64 half-sample positions: of samples (range, (count,)), or of the cells' borders (texture, (count + 1,)).
+    border : int64 half-sample positions: of samples (range, (count,)), of the cells' borders (texture, (count + 1,)).
     block, start, stop : (b,) int64 the blocks this axis covers: index, first and past-last dense position, not wrapped.
     gap : (b,) int64 the widest interval each block's stencil touches, in quarter samples.
     first, last : (b,) int64 the outermost entries of `at` in that stencil.

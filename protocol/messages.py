@@ -18,6 +18,7 @@ from protocol.lattice import Channel, ChannelShape, channel_shapes
 PROTOCOL = "foveascan.v1"
 TEXT_MAX = 4 << 20
 RUNS_MAX = 300_000
+REASON_MAX = 200  # of what a decoder says, which may quote what it was given
 
 Unit = Annotated[float, Meta(ge=0, lt=1)]
 Share = Annotated[float, Meta(gt=0, le=1)]
@@ -27,7 +28,8 @@ Count = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
 Epoch = Annotated[int, Meta(ge=0, le=0xFFFF)]
 ShortText = Annotated[str, Meta(max_length=200)]
 Digest = Annotated[str, Meta(pattern="^[0-9a-f]{16}$")]
-Run = Annotated[list[int], Meta(min_length=3, max_length=3)]
+RunNumber = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+Run = Annotated[list[RunNumber], Meta(min_length=3, max_length=3)]
 Runs = Annotated[list[Run], Meta(max_length=RUNS_MAX)]
 Columns = Annotated[int, Meta(ge=1, le=WIDTH_MAX)]
 Rows = Annotated[int, Meta(ge=1, le=HEIGHT_MAX)]
@@ -91,7 +93,7 @@ class RangeParameters(_Part, frozen=True):
 class TextureParameters(_Part, frozen=True):
     """Texture sampling: p plateau spacing, quality 0..255 (255 lossless), its codec, s the skirt's S'."""
 
-    p: float = 1
+    p: Annotated[float, Meta(ge=1, le=8)] = 1
     quality: Annotated[int, Meta(ge=0, le=255)] = 60
     codec: CodecName = "htj2k"
     s: Annotated[float, Meta(ge=0.1, le=1000)] | None = 1.0
@@ -264,6 +266,7 @@ def decode_message(text: str | bytes) -> Message:
     if len(text) > TEXT_MAX:
         raise RemoteWireError(f"message of {len(text)} bytes is longer than {TEXT_MAX}")
     try:
-        return _decoder.decode(text)
+        message: Message = _decoder.decode(text)
     except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
-        raise RemoteWireError(f"bad message: {error}") from None
+        raise RemoteWireError(f"bad message: {str(error)[:REASON_MAX]}") from None
+    return message

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.errors import LatticeError
 from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, ImageArray, IntArray, StepArray
@@ -21,13 +22,14 @@ from protocol.holdings import ChannelHoldings, HashArray, hash_blocks
 from protocol.lattice import QUARTERS, Axis, ChannelShape, Lattice
 
 BAND_ROWS = 256
+LightArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """One axis of a selection: the run of covered blocks round the adopted ones, and the samples they need.
 
-    block : (b,) int64 block indices.   size : (b,) int64 dense samples in each.   start : first dense position, not wrapped.
+    block : (b,) int64 block indices.   size : (b,) int64 dense samples in each.   start : first dense one, not wrapped.
     sample : (n,) int64 the lattice's samples that travel, ascending.
     low, high : (cells,) int64 for each dense position, the two transmitted samples beside it ...
     part, whole : (cells,) int64 ... and its place between them, part / whole.
@@ -125,7 +127,8 @@ def quantise(range_steps: StepArray, quantum: int) -> StepArray:
 
 def dequantise(values: StepArray, quantum: int) -> StepArray:
     """Inverse of quantise, to within quantum // 2 steps: clamp(k quantum, 1, 65535); never void."""
-    return np.clip(values.astype(np.uint32) * np.uint32(quantum), 1, STEPS_MAX).astype(np.uint16)
+    range_steps: StepArray = np.clip(values.astype(np.uint32) * np.uint32(quantum), 1, STEPS_MAX).astype(np.uint16)
+    return range_steps
 
 
 def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
@@ -149,7 +152,8 @@ def _blend(samples: FloatArray, window: Window) -> FloatArray:
 
 
 def _round_ratio(numerator: FloatArray, denominator: FloatArray) -> StepArray:
-    return np.floor((2 * numerator + denominator) / (2 * denominator)).astype(np.uint16)
+    rounded: StepArray = np.floor((2 * numerator + denominator) / (2 * denominator)).astype(np.uint16)
+    return rounded
 
 
 def texture_patch(selection: Selection, texels: ImageArray) -> ImageArray:
@@ -169,10 +173,11 @@ def texture_patch(selection: Selection, texels: ImageArray) -> ImageArray:
     return patch
 
 
-def _lerp(low: ImageArray, high: ImageArray, part: FloatArray) -> FloatArray:
+def _lerp(low: ImageArray | LightArray, high: ImageArray | LightArray, part: LightArray) -> LightArray:
+    start = low.astype(np.float32)
     if not part.any():
-        return low.astype(np.float32)
-    return low + (high.astype(np.float32) - low) * part
+        return start
+    return start + (high.astype(np.float32) - start) * part
 
 
 def paste(dense: StepArray | ImageArray, patch: StepArray | ImageArray, selection: Selection) -> None:
@@ -212,14 +217,15 @@ def coarse_to_range(coarse_steps: StepArray, shape: ChannelShape) -> StepArray:
     """Dense range from the first view: bilinear between cell centres, voids left out. (H, W) uint16.
 
     coarse_steps : (h, w) uint16, 0 = void. Position of dense column x in coarse units: ((2x + 1) w - W) / 2W, cyclic;
-    rows likewise, clamped. A cell is void iff the nearest coarse cell is; else (2 sum(w z) + d) // (2 d) over measured ones.
+    rows likewise, clamped. A cell is void iff the nearest coarse cell is (ties: the later one); else
+    (2 sum(w z) + d) // (2 d) over the measured ones.
     """
     if coarse_steps.shape != (shape.coarse_height, shape.coarse_width):
         raise LatticeError(f"first view must be {shape.coarse_height} x {shape.coarse_width} range samples")
     x_low, x_high, x_part = _between_centres(shape.width, shape.coarse_width, cyclic=True)
     y_low, y_high, y_part = _between_centres(shape.height, shape.coarse_height, cyclic=False)
     dense = np.empty((shape.height, shape.width), np.uint16)
-    columns = np.where(2 * x_part < 2 * shape.width, x_low, x_high)
+    columns = np.where(x_part < shape.width, x_low, x_high)
     for top in range(0, shape.height, BAND_ROWS):
         band = slice(top, top + BAND_ROWS)
         total, weight = np.zeros((2, y_low[band].size, shape.width))
@@ -229,7 +235,7 @@ def coarse_to_range(coarse_steps: StepArray, shape: ChannelShape) -> StepArray:
                 share = np.multiply.outer(y_weight[band], x_weight) * (corner != VOID)
                 total += share * corner
                 weight += share
-        rows = np.where(2 * y_part[band] < 2 * shape.height, y_low[band], y_high[band])
+        rows = np.where(y_part[band] < shape.height, y_low[band], y_high[band])
         void = coarse_steps[np.ix_(rows, columns)] == VOID
         dense[band] = np.where(void, VOID, _round_ratio(total, np.where(void, 1, weight)))
     return dense

@@ -58,15 +58,18 @@ class Refinement:
     self_contained: bool = False
 
     def to_bytes(self) -> bytes:
-        """Wire form. Raises LocalWireError when a part is too long for it."""
+        """Wire form. Raises LocalWireError when a part does not fit it."""
         parameters = b"" if self.parameters is None else pack_parameters(self.parameters)
         sizes = (len(parameters), len(self.mask), len(self.payload))
         if sizes[0] > PARAMETERS_MAX or sizes[1] > MASK_MAX or sizes[2] > PAYLOAD_MAX:
             raise LocalWireError(f"refinement too long: parameters, mask, payload of {sizes} bytes")
-        header = HEADER.pack(
-            MAGIC, VERSION, self.generator, self.channel, self.codec, int(self.self_contained), 0,
-            self.epoch, self.quality, self.seq, self.look, self.samples, sizes[0], 0, sizes[1], sizes[2],
-        )  # fmt: skip
+        try:
+            header = HEADER.pack(
+                MAGIC, VERSION, self.generator, self.channel, self.codec, int(self.self_contained), 0,
+                self.epoch, self.quality, self.seq, self.look, self.samples, sizes[0], 0, sizes[1], sizes[2],
+            )  # fmt: skip
+        except struct.error as error:
+            raise LocalWireError(f"refinement out of bounds: {error}") from None
         body = b"".join((header, parameters, self.mask, self.payload))
         return body + CRC.pack(zlib.crc32(body))
 
@@ -89,8 +92,16 @@ class Refinement:
 
 
 def pack_parameters(p: Parameters) -> bytes:
-    """Lattice parameters as they travel: 17 bytes, then the listed runs as varints when there are any."""
-    head = PARAMETERS.pack(p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y)
+    """Lattice parameters as they travel: 17 bytes, then the listed runs as varints when there are any.
+
+    Raises LocalWireError when they do not fit.
+    """
+    if p.listed is not None and not p.listed:
+        raise LocalWireError("a list of blocks needs at least one run")
+    try:
+        head = PARAMETERS.pack(p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y)
+    except struct.error as error:
+        raise LocalWireError(f"lattice parameters out of bounds: {error}") from None
     return head + b"".join(_varint(run) for run in p.listed or ())
 
 
@@ -99,13 +110,15 @@ def unpack_parameters(data: bytes) -> Parameters:
     if len(data) < PARAMETERS.size:
         raise RemoteWireError("lattice parameters are cut short")
     runs = _varints(data[PARAMETERS.size :])
-    return Parameters(*PARAMETERS.unpack_from(data), listed=runs or None)
+    half_spacing, block_x, block_y, wide, high, rho_x, rho_y = PARAMETERS.unpack_from(data)
+    return Parameters(half_spacing, block_x, block_y, wide, high, rho_x, rho_y, runs or None)
 
 
 def _read_header(data: bytes) -> tuple[Generator, Channel, int, int, int, int, int, int, int, tuple[int, int, int]]:
     if len(data) < HEADER.size + CRC.size:
         raise RemoteWireError("refinement is cut short")
-    (magic, version, generator, channel, codec, flags, _, epoch, quality, seq, look, samples, *sizes) = HEADER.unpack_from(data)
+    fields = HEADER.unpack_from(data)
+    magic, version, generator, channel, codec, flags, _, epoch, quality, seq, look, samples, *sizes = fields
     if magic != MAGIC or version != VERSION:
         raise RemoteWireError(f"not a refinement of version {VERSION}")
     parameters_size, _, mask_size, payload_size = sizes
@@ -127,6 +140,8 @@ def _running(start: int, sizes: tuple[int, ...]) -> list[int]:
 
 
 def _varint(value: int) -> bytes:
+    if not 0 <= value < 1 << 7 * VARINT_MAX:
+        raise LocalWireError(f"run length {value} out of bounds")
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)

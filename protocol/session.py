@@ -1,8 +1,8 @@
 """The order of a stream, for both ends. All transitions live here; nothing here does I/O or knows what a scan is.
 
 A Session turns what arrives into messages and refinements, and what is to be sent into text or bytes. It refuses what
-the other end may not say now (RemoteWireError) and what we may not (LocalWireError). Joined to each other, the two roles
-test each other.
+the other end may not say now (RemoteWireError) and what we may not (LocalWireError). Joined to each other, the two
+roles test each other.
 
     phase     node says                                        client says
     new       serverInfo -> greeted                            -
