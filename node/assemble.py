@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from protocol.errors import FoveascanError, RemoteWireError
 from protocol.grid import VOID, Grid, GridSpec, ImageArray, IntArray, StepArray
 
-COUNTS_MAX = 1 << 24
+COUNTS_MAX = 1 << 31
 COUNTS_PER_COLUMN_MIN = 2
 TURNS_KEPT = 2
 STRIP_COLUMNS = 64
@@ -49,7 +49,7 @@ class IncompleteTurn(FoveascanError):
 class Encoder:
     """How encoder counts become angles on the grid.
 
-    counts_per_turn : up to 2^24, at least two per column.  direction : +1 where counts grow with the column, else -1.
+    counts_per_turn : up to 2^31, at least two per column.  direction : +1 where counts grow with the column, else -1.
     zero_count : the count at the left edge of column 0, that is at GridSpec.theta0_rad.
     A count stands for the angle that it is nearest to. Raises ValueError when out of bounds.
     """

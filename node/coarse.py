@@ -114,11 +114,11 @@ def average_texture(texture: ImageArray, measured: BoolArray, rows: int, columns
     """
     height, width = texture.shape[:2]
     mask_row = _nearest(height, measured.shape[0])
-    mask_column = _nearest(width, measured.shape[1])
+    mask_wide = np.take(measured, _nearest(width, measured.shape[1]), axis=1).view(np.uint8)
     means = np.empty((rows, columns, 3), np.uint8)
     for row, band in enumerate(_bands(height, rows)):
         texels = np.asarray(texture[band.rows])
-        mask = measured[mask_row[band.rows]][:, mask_column].view(np.uint8)
+        mask = mask_wide[mask_row[band.rows]]
         area = _cell_sums(mask, band, columns)[:, None]
         total = _cell_sums(np.asarray(cv2.copyTo(texels, mask), np.uint8), band, columns)
         if not area.all():
@@ -137,13 +137,15 @@ def fill_voids(range_steps: StepArray) -> StepArray:
         return _read_only(np.array(range_steps))
     columns = range_steps.shape[1]
     pad = min(_reach(void), columns)
-    turn = np.arange(-pad, columns + pad) % columns
-    wide = np.ascontiguousarray(range_steps[:, turn])
+    wide = np.concatenate([range_steps[:, columns - pad :], range_steps, range_steps[:, :pad]], axis=1)
     _, label = cv2.distanceTransformWithLabels(
         (wide == VOID).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     source = np.concatenate([[np.uint16(VOID)], wide[wide != VOID]])  # labels count measured samples from 1
-    return _read_only(source[label[:, pad : pad + columns]])
+    filled = np.array(range_steps)
+    at = void.view(np.bool_)
+    filled[at] = source[label[:, pad : pad + columns][at]]
+    return _read_only(filled)
 
 
 def build_pyramid(texture: ImageArray, spacing_max: int) -> tuple[ImageArray, ...]:
