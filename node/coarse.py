@@ -13,7 +13,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import count
 from typing import TypeVar
 
 import cv2
@@ -77,18 +76,16 @@ def build_coarse(grid: Grid, first_view_bytes: int = FIRST_VIEW_BYTES) -> Coarse
 
 
 def coarse_shape(height: int, width: int, spacing_min: int, cells_max: int) -> tuple[int, int]:
-    """Rows and columns of a coarse grid: the smallest power of two >= spacing_min that needs at most cells_max cells.
+    """Rows and columns of a coarse grid: the smallest spacing, spacing_min doubled, that needs at most cells_max cells.
 
     Raises ValueError when cells_max < 1.
     """
     if cells_max < 1:
         raise ValueError(f"a coarse grid needs at least one cell, got room for {cells_max}")
-    for power in count():
-        spacing = spacing_min << power
-        rows, columns = -(-height // spacing), -(-width // spacing)
-        if rows * columns <= cells_max:
-            return rows, columns
-    raise AssertionError("unreachable: a large enough spacing leaves one cell")
+    spacing = spacing_min
+    while (rows := -(-height // spacing)) * (columns := -(-width // spacing)) > cells_max:
+        spacing *= 2
+    return rows, columns
 
 
 def average_range(range_steps: StepArray, rows: int, columns: int) -> StepArray:
