@@ -1,0 +1,297 @@
+"""One client's stream: reads what it asks, plans the newest look, sends one update at a time.
+
+Two tasks share a connection. The reader takes messages as they come and never waits for anything slow; the sender opens
+scans and answers looks, one update unacknowledged at a time. A newer look supersedes one that is not sent yet.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from aiohttp import WSMsgType, web
+
+from node.auth import Auth
+from node.exhibits import Exhibits
+from node.foveate import Update, plan_update
+from node.library import Scan
+from node.rate import RateControl
+from node.state import ClientState
+from protocol import messages as m
+from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
+from protocol.holdings import ChannelHoldings
+from protocol.lattice import Channel
+from protocol.session import Phase, Role, Session
+
+log = logging.getLogger(__name__)
+
+OPENS_MAX = 4
+HELLO_S = 10.0
+ACK_S = 60.0
+CLOSE_PROTOCOL_ERROR = 1002
+
+
+@dataclass(slots=True, eq=False)
+class _Bound:
+    """The scan a stream is looking at."""
+
+    epoch: int
+    scan: Scan
+    state: ClientState
+    next_seq: int
+
+
+class Connection:
+    """One stream from its greeting to its end."""
+
+    def __init__(self, socket: web.WebSocketResponse, auth: Auth, exhibits: Exhibits, info: m.ServerInfo, cold_start_bytes_s: float) -> None:
+        self._socket = socket
+        self._auth = auth
+        self._exhibits = exhibits
+        self._info = info
+        self._session = Session(Role.NODE)
+        self._rate = RateControl(cold_start_bytes_s)
+        self._codec: m.CodecName = "htj2k"
+        self._bound: _Bound | None = None
+        self._epoch = 0
+        self._opens: deque[m.Open] = deque()
+        self._look: m.Look | None = None
+        self._running_look: m.Look | None = None
+        self._news: deque[m.Published] = deque(maxlen=16)
+        self._work = asyncio.Event()
+        self._acknowledged = asyncio.Event()
+        self._sent_bytes, self._sent_s = 0, 0.0
+
+    async def run(self) -> None:
+        """Serve until the client goes. Never raises for what the client does."""
+        await self._send(self._info)
+        try:
+            if not await self._let_in():
+                return
+            async with asyncio.TaskGroup() as tasks:
+                sender = tasks.create_task(self._answer())
+                await self._read()
+                sender.cancel()
+        except* RemoteWireError as errors:
+            await self._turn_away(str(errors.exceptions[0]))
+        except* (ConnectionError, TimeoutError):
+            pass
+
+    def publish(self, scan_id: str) -> None:
+        """Tell the client of a new scan, when it is listening."""
+        self._news.append(m.Published(scan_id))
+        self._work.set()
+
+    async def close(self, reason: str) -> None:
+        """Say goodbye and end the stream."""
+        if self._session.phase is Phase.READY:
+            await self._send(m.Goodbye(reason))
+        await self._socket.close(message=reason.encode()[:120])
+
+    # -- reading ---------------------------------------------------------------------------------------------------
+
+    async def _let_in(self) -> bool:
+        async with asyncio.timeout(HELLO_S):
+            message = await self._receive()
+        if message is None:
+            return False
+        assert isinstance(message, m.Hello)  # the session lets nothing else through
+        role = self._auth.admit_stream(message)
+        if message.protocol != m.PROTOCOL or role is None:
+            code, why = ("forbidden", "this node needs a token") if role is None else ("bad request", f"this node speaks {m.PROTOCOL}")
+            await self._send(m.Refused(0, code, why))  # type: ignore[arg-type]
+            return False
+        self._codec = message.codecs[0]
+        await self._send(m.Welcome(role))
+        return True
+
+    async def _read(self) -> None:
+        while (message := await self._receive()) is not None:
+            match message:
+                case m.Open():
+                    if len(self._opens) >= OPENS_MAX:
+                        await self._send(m.Refused(message.request, "busy", "too many scans are being opened"))
+                    else:
+                        self._opens.append(message)
+                        self._work.set()
+                case m.Look():
+                    await self._take_look(message)
+                case m.Cancel():
+                    await self._forget(message.request)
+                case m.Ack():
+                    await self._take_ack(message)
+                case m.State():
+                    await self._take_state(message)
+
+    async def _receive(self) -> m.Message | None:
+        """The next message, or None when the stream has ended. Raises RemoteWireError."""
+        frame = await self._socket.receive()
+        if frame.type is WSMsgType.TEXT:
+            said = self._session.receive(frame.data)
+            return said if isinstance(said, m.Message) else None
+        if frame.type is WSMsgType.BINARY:
+            raise RemoteWireError("a client sends no binary messages")
+        if frame.type is WSMsgType.ERROR:
+            raise RemoteWireError(f"bad frame: {self._socket.exception()}")
+        return None
+
+    async def _take_look(self, look: m.Look) -> None:
+        if self._look is not None:
+            await self._send(self._superseded(self._look))
+        self._look = look
+        self._work.set()
+
+    async def _forget(self, request: int) -> None:
+        if self._look is not None and self._look.request == request:
+            look, self._look = self._look, None
+            await self._send(self._superseded(look))
+        if self._running_look is not None and self._running_look.request == request:
+            self._running_look = None
+
+    async def _take_ack(self, ack: m.Ack) -> None:
+        bound = self._bound
+        if bound is None or ack.epoch != bound.epoch or ack.next_seq != bound.next_seq:
+            return  # of an update that a newer opening has overtaken
+        if not self._acknowledged.is_set():
+            self._rate.acknowledged(self._sent_bytes, time.monotonic() - self._sent_s, ack.apply_ms / 1000)
+        if ack.digest != bound.state.holdings.digest():
+            await self._send(m.Resync(bound.epoch, "digests differ"))
+            return
+        self._acknowledged.set()
+
+    async def _take_state(self, said: m.State) -> None:
+        bound = self._bound
+        if bound is None or said.epoch != bound.epoch:
+            return
+        _adopt_word(bound.state, said.holdings)
+        bound.next_seq = said.next_seq
+        self._acknowledged.set()
+
+    # -- answering -------------------------------------------------------------------------------------------------
+
+    async def _answer(self) -> None:
+        while True:
+            await self._work.wait()
+            self._work.clear()
+            while self._news:
+                await self._send(self._news.popleft())
+            while self._opens:
+                await self._open(self._opens.popleft())
+            if self._look is not None:
+                await self._await_ack()
+                look, self._look = self._look, None
+                if look is not None:
+                    await self._answer_look(look)
+                if self._opens or self._look is not None or self._news:
+                    self._work.set()
+
+    async def _await_ack(self) -> None:
+        if self._bound is not None:
+            async with asyncio.timeout(ACK_S):
+                await self._acknowledged.wait()
+
+    async def _open(self, wanted: m.Open) -> None:
+        try:
+            scan, view = await self._exhibits.open(wanted.scan, self._codec)
+            self._epoch = (self._epoch + 1) & 0xFFFF
+            bound = _Bound(self._epoch, scan, view.state.copy(), 0)
+            if wanted.holdings is not None:
+                _adopt_word(bound.state, wanted.holdings)
+        except LibraryError as error:
+            await self._send(m.Refused(wanted.request, "not found", str(error)[:500]))
+            return
+        self._bound = bound
+        self._acknowledged.clear()
+        await self._send(m.Opened(wanted.request, bound.epoch, view.info))
+        if wanted.holdings is not None:
+            self._acknowledged.set()
+            return
+        bound.next_seq = 2
+        self._begin_timing()
+        for refinement in view.refinements(bound.epoch):
+            await self._send_bytes(refinement)
+
+    async def _answer_look(self, look: m.Look) -> None:
+        bound = self._bound
+        if bound is None:
+            await self._send(m.Refused(look.request, "not open", "open a scan first"))
+            return
+        self._running_look = look
+        started_s = time.monotonic()
+        try:
+            update = await self._plan(bound, look)
+        except (LatticeError, CodecError) as error:
+            await self._send(m.Refused(look.request, "bad request", str(error)[:500]))
+            return
+        finally:
+            still_wanted, self._running_look = self._running_look is look, None
+        spent_s = time.monotonic() - started_s
+        if update.reason == "superseded" or not still_wanted:
+            await self._send(self._superseded(look))
+            return
+        self._rate.encoded(spent_s)
+        await self._send_update(bound, look, update, spent_s)
+
+    async def _plan(self, bound: _Bound, look: m.Look) -> Update:
+        budget = look.max_bytes
+        if look.max_wait_s is not None:
+            affordable = self._rate.budget_bytes(look.max_wait_s)
+            budget = affordable if budget is None else min(budget, affordable)
+        newer: Callable[[], bool] = lambda: self._look is not None or self._running_look is not look  # noqa: E731
+        return await self._exhibits.work(partial(plan_update, bound.scan, bound.state, look, self._codec, budget, newer))
+
+    async def _send_update(self, bound: _Bound, look: m.Look, update: Update, spent_s: float) -> None:
+        bound.state = update.state
+        if update.coded:
+            self._acknowledged.clear()
+            self._begin_timing()
+        for coded in update.coded:
+            await self._send_bytes(coded.refinement(bound.epoch, bound.next_seq, look.request).to_bytes())
+            bound.next_seq += 1
+        await self._send(
+            m.Updated(
+                look.request, bound.next_seq, update.reason, update.error_max_mm, update.texture_db, update.encodes,
+                round(1000 * spent_s, 3),
+            )  # fmt: skip
+        )
+
+    # -- writing ---------------------------------------------------------------------------------------------------
+
+    def _begin_timing(self) -> None:
+        self._sent_bytes, self._sent_s = 0, time.monotonic()
+
+    async def _send(self, message: m.FromNode) -> None:
+        text = self._session.send(message)
+        assert isinstance(text, str)
+        await self._socket.send_str(text)
+
+    async def _send_bytes(self, data: bytes) -> None:
+        self._sent_bytes += len(data)
+        await self._socket.send_bytes(data)
+
+    def _superseded(self, look: m.Look) -> m.Updated:
+        next_seq = self._bound.next_seq if self._bound else 0
+        return m.Updated(look.request, next_seq, "superseded")
+
+    async def _turn_away(self, why: str) -> None:
+        log.warning("stream ended: %s", why)
+        if not self._socket.closed:
+            await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=why.encode()[:120])
+
+
+def _adopt_word(state: ClientState, said: m.Statement) -> None:
+    """Take the client's word for what it holds. Raises RemoteWireError when it is no statement of this scan."""
+    try:
+        channels = {
+            Channel.RANGE: ChannelHoldings.from_runs(state.shapes[Channel.RANGE], said.range),
+            Channel.TEXTURE: ChannelHoldings.from_runs(state.shapes[Channel.TEXTURE], said.texture),
+        }
+    except LatticeError as error:
+        raise RemoteWireError(f"holdings: {error}") from None
+    state.holdings.channels = channels
+    state.holdings.content = 0

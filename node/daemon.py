@@ -1,0 +1,88 @@
+"""The node as a whole: library, capture thread, server and announcement, started in order and stopped in reverse."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+from drivers.port import Port
+from drivers.scanner import ScannerConfig
+from drivers.serial_port import SerialPort
+from node.advertise import Advertisement
+from node.capture import Capture
+from node.config import Config
+from node.exhibits import Exhibits
+from node.identity import node_identity
+from node.library import About, Library
+from node.serve import NodeServer
+from protocol import messages as m
+from protocol.grid import Grid
+
+log = logging.getLogger(__name__)
+
+
+async def run_node(config: Config, ready: Callable[[str], None]) -> None:
+    """Serve until SIGTERM or SIGINT. ready : called once with the node's URL when everything is up."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    async with AsyncExitStack() as stack:
+        url = await start_node(config, stack)
+        ready(url)
+        await stop.wait()
+        log.info("stopping")
+
+
+async def start_node(config: Config, stack: AsyncExitStack) -> str:
+    """Bring up every part and leave its end to the stack. Returns the URL clients use."""
+    folder = config.library.path
+    library = await asyncio.to_thread(Library, folder, config.first_view.max_bytes)
+    for problem in library.problems:
+        log.warning("library: %s left alone: %s", problem.name, problem.reason)
+    exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers)
+    stack.callback(exhibits.close)
+    capture, announce = _capture(config, library)
+    info = _server_info(config, folder)
+    server = NodeServer(config, info, exhibits, capture)
+    host, port = await server.start()
+    stack.push_async_callback(server.stop)
+    announce.append(partial(asyncio.get_running_loop().call_soon_threadsafe, server.publish))
+    if capture is not None:
+        capture.start()
+        stack.push_async_callback(asyncio.to_thread, capture.stop)
+    if config.discovery.enabled:
+        await stack.enter_async_context(Advertisement(info.name, info.id, host, port))
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _capture(config: Config, library: Library) -> tuple[Capture | None, list[Callable[[str], object]]]:
+    """The capture thread's owner, and the list of who is told of each new scan."""
+    announce: list[Callable[[str], object]] = []
+    path = config.capture.scanner
+    if path is None:
+        return None, announce
+
+    def open_port() -> Port:
+        return SerialPort(path, config.capture.baud)
+
+    def deliver(grid: Grid) -> None:
+        scan = library.add(grid, About(time.time()))
+        log.info("scan published: %d x %d", grid.spec.width, grid.spec.height)
+        for tell in announce:
+            tell(scan.id)
+
+    return Capture(open_port, ScannerConfig(quiet_s=config.capture.stale_s), deliver), announce
+
+
+def _server_info(config: Config, folder: Path) -> m.ServerInfo:
+    name = config.discovery.name or socket.gethostname()
+    return m.ServerInfo(m.PROTOCOL, node_identity(folder), name, version("foveascan"))

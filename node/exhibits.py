@@ -1,0 +1,64 @@
+"""The library as streams and requests use it: scans opened once, first views encoded once, work done off the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from node.first_view import FirstView, build_first_view
+from node.library import Library, Scan
+from protocol.errors import LibraryError
+from protocol.messages import CodecName
+
+VIEWS_MAX = 8
+T = TypeVar("T")
+
+
+class Exhibits:
+    """Opened scans with their first views. For one event loop; `work` runs in a few threads of its own."""
+
+    def __init__(self, library: Library, first_view_bytes: int, workers: int) -> None:
+        self.library = library
+        self._first_view_bytes = first_view_bytes
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="encode")
+        self._views: OrderedDict[tuple[str, CodecName], asyncio.Future[tuple[Scan, FirstView]]] = OrderedDict()
+
+    async def open(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]:
+        """A scan ("latest" or an id) and its first view. Raises LibraryError when there is none such."""
+        key = self.resolve(scan_id), codec
+        future = self._views.get(key)
+        if future is None:
+            future = asyncio.ensure_future(self.work(lambda: self._build(*key)))
+            self._views[key] = future
+            while len(self._views) > VIEWS_MAX:
+                self._views.popitem(last=False)
+        self._views.move_to_end(key)
+        try:
+            return await asyncio.shield(future)
+        except LibraryError:
+            self._views.pop(key, None)
+            raise
+
+    def resolve(self, scan_id: str) -> str:
+        """The id that "latest" stands for; any other is returned as it is. Raises LibraryError when there is none."""
+        if scan_id != "latest":
+            return scan_id
+        scans = self.library.scans()
+        if not scans:
+            raise LibraryError("there is no scan yet: start a sweep")
+        return scans[0].id
+
+    async def work(self, job: Callable[[], T]) -> T:
+        """Run a job in one of the encoding threads."""
+        return await asyncio.get_running_loop().run_in_executor(self._pool, job)
+
+    def close(self) -> None:
+        """Let running jobs end, start no more."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _build(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]:
+        scan = self.library.open(scan_id)
+        return scan, build_first_view(scan, codec, self._first_view_bytes)

@@ -1,0 +1,178 @@
+"""HTTP and the stream on one port: what clients may ask, turned into calls on the library, the scanner and connections."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from dataclasses import asdict
+
+import msgspec
+from aiohttp import web
+
+from node.auth import Auth, require
+from node.capture import Capture
+from node.config import Config
+from node.connection import Connection
+from node.exhibits import Exhibits
+from node.first_view import scan_info
+from node.library import ScanSummary
+from protocol import messages as m
+from protocol.errors import LibraryError
+
+log = logging.getLogger(__name__)
+
+NOT_SENT_LOW_WATER_BYTES = 16 * 1024
+SEND_BUFFER_BYTES = 64 * 1024
+WRITE_LIMIT_BYTES = 16 * 1024
+HEARTBEAT_S = 20.0
+BODY_MAX_BYTES = 1 << 16
+GOODBYE_S = 2.0
+SECURITY_HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "default-src 'self'",
+}
+
+
+class NodeServer:
+    """The node as clients see it; everything here runs in one event loop."""
+
+    def __init__(self, config: Config, info: m.ServerInfo, exhibits: Exhibits, capture: Capture | None) -> None:
+        self._config = config
+        self._info = info
+        self._exhibits = exhibits
+        self._capture = capture
+        self._auth = Auth(config.server)
+        self._connections: set[Connection] = set()
+        self._app = web.Application(middlewares=[self._auth.admit, _explain], client_max_size=BODY_MAX_BYTES)
+        self._app.on_response_prepare.append(_harden)
+        self._app.add_routes([
+            web.get("/", self._page),
+            web.get("/healthz", self._health),
+            web.get("/v1/node", self._node),
+            web.get("/v1/scans", self._scans),
+            web.get("/v1/scans/{scan}", self._scan),
+            web.get("/v1/scans/{scan}/coarse", self._coarse),
+            web.post("/v1/sweeps", self._sweep),
+            web.get("/v1/stream", self._stream),
+        ])  # fmt: skip
+        self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False)
+
+    async def start(self) -> tuple[str, int]:
+        """Begin to listen. Returns the address bound. Raises OSError when it cannot be."""
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, self._config.server.host, self._config.server.port)
+        await site.start()
+        host, port = self._runner.addresses[0][:2]
+        return str(host), int(port)
+
+    async def stop(self) -> None:
+        """Tell every client, then stop listening."""
+        goodbyes = [connection.close("the node is stopping") for connection in self._connections]
+        if goodbyes:
+            await asyncio.wait([asyncio.ensure_future(goodbye) for goodbye in goodbyes], timeout=GOODBYE_S)
+        await self._runner.cleanup()
+
+    def publish(self, scan_id: str) -> None:
+        """Tell every client of a new scan."""
+        for connection in self._connections:
+            connection.publish(scan_id)
+
+    # -- what may be asked -----------------------------------------------------------------------------------------
+
+    async def _page(self, request: web.Request) -> web.Response:
+        return web.Response(text=f"foveascan node {self._info.name}: use the command `foveascan look --node {request.url.origin()}`\n")
+
+    async def _health(self, request: web.Request) -> web.Response:
+        return _json({"status": "ready", "capture": self._capture_status()})
+
+    async def _node(self, request: web.Request) -> web.Response:
+        problems = [asdict(problem) for problem in self._exhibits.library.problems]
+        return _json({**msgspec.to_builtins(self._info), "capture": self._capture_status(), "problems": problems})
+
+    async def _scans(self, request: web.Request) -> web.Response:
+        return _json([_summary(scan) for scan in self._exhibits.library.scans()])
+
+    async def _scan(self, request: web.Request) -> web.Response:
+        scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
+        return _json(msgspec.to_builtins(scan_info(scan)))
+
+    async def _coarse(self, request: web.Request) -> web.Response:
+        """The first view as its two refinements, one behind the other, each behind its length (u32, little-endian)."""
+        codec: m.CodecName = "jpeg" if request.query.get("codec") == "jpeg" else "htj2k"
+        _, view = await self._exhibits.open(request.match_info["scan"], codec)
+        body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
+        return web.Response(body=body, content_type="application/octet-stream")
+
+    async def _sweep(self, request: web.Request) -> web.Response:
+        require(request, "operate")
+        if self._capture is None:
+            raise web.HTTPConflict(text="this node has no scanner: start it with --scanner PATH")
+        if not self._capture.request_sweep():
+            raise web.HTTPConflict(text="a sweep is running already")
+        return _json(self._capture_status(), status=202)
+
+    async def _stream(self, request: web.Request) -> web.WebSocketResponse:
+        if len(self._connections) >= self._config.server.max_clients:
+            raise web.HTTPServiceUnavailable(text="too many clients: try again later")
+        stream = web.WebSocketResponse(
+            protocols=(m.PROTOCOL,), max_msg_size=m.TEXT_MAX, heartbeat=HEARTBEAT_S, compress=False,
+            writer_limit=WRITE_LIMIT_BYTES,
+        )  # fmt: skip
+        await stream.prepare(request)
+        _bound_buffers(request)
+        cold_start = self._config.planner.cold_start_bytes_s
+        connection = Connection(stream, self._auth, self._exhibits, self._info, cold_start)
+        self._connections.add(connection)
+        try:
+            await connection.run()
+        finally:
+            self._connections.discard(connection)
+        return stream
+
+    def _capture_status(self) -> dict[str, object]:
+        return asdict(self._capture.status) if self._capture else {"phase": "no scanner"}
+
+
+def _summary(scan: ScanSummary) -> dict[str, object]:
+    s = scan.spec
+    return {
+        "id": scan.id, "created": scan.about.created_unix_s, "source": scan.about.source, "name": scan.about.name,
+        "width": s.width, "height": s.height, "textureWidth": s.texture_width, "textureHeight": s.texture_height,
+    }  # fmt: skip
+
+
+def _json(value: object, status: int = 200) -> web.Response:
+    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
+
+
+def _bound_buffers(request: web.Request) -> None:
+    """Keep little between us and a slow client, so that a click overtakes what was meant for an older one."""
+    transport = request.transport
+    if transport is None:
+        return
+    transport.set_write_buffer_limits(high=WRITE_LIMIT_BYTES)
+    line = transport.get_extra_info("socket")
+    line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, NOT_SENT_LOW_WATER_BYTES)
+
+
+async def _harden(request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(SECURITY_HEADERS)
+
+
+@web.middleware
+async def _explain(request: web.Request, handler: web.RequestHandler) -> web.StreamResponse:  # type: ignore[type-arg]
+    """Errors as one JSON object: what is wrong, and where it can be known, the cure."""
+    try:
+        return await handler(request)  # type: ignore[operator,no-any-return]
+    except LibraryError as error:
+        return _json({"error": str(error)}, status=404)
+    except web.HTTPException as error:
+        if error.status < 400:
+            raise
+        return _json({"error": error.text}, status=error.status)
