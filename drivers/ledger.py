@@ -34,8 +34,9 @@ class _Track:
 
     def missing(self) -> BoolArray:
         """(W,) columns with at least one piece missing."""
-        held = np.frombuffer(self.held, np.bool_).reshape(self.columns, self.pieces)
-        return np.logical_not(np.all(held, axis=1))
+        held = np.frombuffer(self.held, np.uint8).reshape(self.columns, self.pieces)
+        lacking: BoolArray = held.min(axis=1) == 0
+        return lacking
 
 
 class Ledger:

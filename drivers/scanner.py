@@ -140,9 +140,7 @@ class Scanner:
         session = 1 + secrets.randbelow(65535)
         config = self._config
         self._info = None
-        link = ScannerLink(
-            Role.HOST, session=session, payload_max=config.payload_max, window_bytes=config.window_bytes
-        )
+        link = ScannerLink(Role.HOST, session=session, payload_max=config.payload_max, window_bytes=config.window_bytes)
         self._link = link
         link.tick(self._clock())
         link.greet()

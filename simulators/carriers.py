@@ -1,4 +1,4 @@
-"""What carries a simulated scanner's bytes: nothing but memory, with a time of its own; or a pty as slow as its baud rate."""
+"""What carries a simulated scanner's bytes: memory with a time of its own, or a pty as slow as its baud rate."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ _READ_BYTES = 65536
 _PORTION_BYTES = 4096
 _BITS_PER_BYTE = 10  # start, eight data, stop
 _CATCH_UP_S = 0.02  # a sleep that came back late may be made good up to this
-_DEAF_S = 1.0  # a UART would have sent its bits into the void by then
 
 Line = Callable[[bytes], bytes]
 
@@ -125,12 +124,13 @@ class PtyPort:
         return os.read(self._master, max_bytes) if self._master in ready else b""
 
     def write(self, data: bytes) -> None:
-        """Send `data` at the pace of the line; bytes that nobody takes for a second are lost, as on a real line."""
+        """Send `data` at the pace of the line; waits while nobody reads, until `cancel`. (A new reader starts by
+        emptying the line, so this waits for it at longest.)"""
         rest = memoryview(data)
         while rest:
-            _, writable, _ = select.select([], [self._master], [], _DEAF_S)
-            if not writable:
-                break
+            woken, _, _ = select.select([self._wake_read], [self._master], [])
+            if woken:
+                return
             with suppress(BlockingIOError):
                 rest = rest[os.write(self._master, rest) :]
         self._pace(len(data))
@@ -171,7 +171,7 @@ def serve(scanner: SimulatedScanner, port: PtyPort, stop: threading.Event) -> No
 
 def _replace_link(path: Path, target: str) -> None:
     """Make `path` a symbolic link to `target`, in one step; FileExistsError where something else stands there."""
-    if path.exists(follow_symlinks=False) and not path.is_symlink():
+    if os.path.lexists(path) and not path.is_symlink():
         raise FileExistsError(f"{path} exists and is no symbolic link")
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     os.symlink(target, fresh)

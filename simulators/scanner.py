@@ -1,7 +1,7 @@
 """A software scanner: a turntable that speaks the device's end of the scanner link. No I/O and no clock of its own.
 
-It sends columns live, in the order the table turns, and holds the newest `retention_columns` of them to send again. When
-the node gives no credit, a few columns wait in the outbox and then the table stops: nothing is dropped.
+It sends columns live, in the order the table turns, and holds the newest `retention_columns` of them to send again.
+When the node gives no credit, a few columns wait in the outbox and then the table stops: nothing is dropped.
 """
 
 from __future__ import annotations
@@ -121,9 +121,9 @@ class SimulatedScanner:
                 case Command():
                     self._obey(event)
                 case Hello():
-                    self._announce_again()
-                case Accepted(SweepHeader()):
-                    self._begin()
+                    self._announce()
+                case Accepted(SweepHeader() as header):
+                    self._begin(header)
                 case Unanswered(SweepHeader()):
                     self._rest()
 
@@ -134,7 +134,7 @@ class SimulatedScanner:
         else:
             self._link.refuse(command, *refusal)
         if refusal is None and isinstance(command.message, SweepStart):
-            self._announce_again()
+            self._announce()
 
     def _do(self, message: object) -> tuple[NakCode, str] | None:
         """Carry out a command, or say why not."""
@@ -201,13 +201,13 @@ class SimulatedScanner:
         self.state = State.SWEEPING
         return None
 
-    def _announce_again(self) -> None:
-        """Say the header; turning waits until it is acknowledged."""
+    def _announce(self) -> None:
+        """Say the header of a sweep that waits to begin: it turns only when the node knows what is coming."""
         if self._sweep is not None and not self._sweep.is_announced:
             self._link.send(self._sweep.header)
 
-    def _begin(self) -> None:
-        if self._sweep is not None:
+    def _begin(self, header: SweepHeader) -> None:
+        if self._sweep is not None and self._sweep.header is header:
             self._sweep.is_announced = True
 
     def _stop(self, sweep: int) -> tuple[NakCode, str] | None:

@@ -68,7 +68,13 @@ class Turntable:
     """
 
     def __init__(
-        self, specimen: Standing, *, turn_s: float = 1.0, jitter_counts: float = 0.0, home_encoder: int = 0, seed: int = 0
+        self,
+        specimen: Standing,
+        *,
+        turn_s: float = 1.0,
+        jitter_counts: float = 0.0,
+        home_encoder: int = 0,
+        seed: int = 0,
     ) -> None:
         spec = specimen.grid.spec
         nominal = math.lcm(2 * spec.width, 2 * spec.texture_width)
