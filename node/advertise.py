@@ -1,4 +1,4 @@
-"""Announcing the node on the LAN by DNS-SD, so that clients find it without being told. No word of patients or scans."""
+"""Announcing the node on the LAN by DNS-SD, so that clients find it untold. No word of patients or scans."""
 
 from __future__ import annotations
 

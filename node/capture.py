@@ -35,7 +35,7 @@ Phase = Literal["no scanner", "connecting", "ready", "sweeping", "stopped"]
 
 @dataclass(frozen=True, slots=True)
 class CaptureStatus:
-    """What the scanner is doing. progress: share of the sweep that is in, 0..1; sweeps: finished ones; why: last trouble."""
+    """What the scanner is doing. progress: share of the sweep that is in; sweeps: finished ones; why: last trouble."""
 
     phase: Phase
     progress: float = 0.0

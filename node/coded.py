@@ -18,7 +18,8 @@ FRAME_BYTES = 10  # WebSocket's own, at most
 class Coded:
     """Samples of a lattice, encoded.
 
-    adopted : (by, bx) bool over the lattice's covered blocks.   rank, quality, codec : as in protocol.holdings, .refinement.
+    adopted : (by, bx) bool over the lattice's covered blocks.
+    rank, quality, codec : as in protocol.holdings and protocol.refinement.
     """
 
     selection: Selection

@@ -13,7 +13,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     serve.add_argument("--library", metavar="DIR", help="folder the scans are kept in")
     serve.add_argument("--listen", metavar="HOST:PORT", help="address to serve (127.0.0.1:7345); port 0: any free one")
     serve.add_argument("--insecure", action="store_true", default=None, help="plain HTTP without login, loopback only")
-    serve.add_argument("--scanner", metavar="PATH", help="serial port of the scanner; without it only the library is served")
+    serve.add_argument("--scanner", metavar="PATH", help="serial port of the scanner; none: library only")
     serve.add_argument("--baud", type=int, help="its speed in baud (3000000)")
     serve.add_argument("--name", help="name to announce on the network (this host's)")
     serve.add_argument("--json", action="store_true", help="print one JSON object once the node is ready")

@@ -10,7 +10,6 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -49,7 +48,14 @@ class _Bound:
 class Connection:
     """One stream from its greeting to its end."""
 
-    def __init__(self, socket: web.WebSocketResponse, auth: Auth, exhibits: Exhibits, info: m.ServerInfo, cold_start_bytes_s: float) -> None:
+    def __init__(
+        self,
+        socket: web.WebSocketResponse,
+        auth: Auth,
+        exhibits: Exhibits,
+        info: m.ServerInfo,
+        cold_start_bytes_s: float,
+    ) -> None:
         self._socket = socket
         self._auth = auth
         self._exhibits = exhibits
@@ -102,9 +108,11 @@ class Connection:
             return False
         assert isinstance(message, m.Hello)  # the session lets nothing else through
         role = self._auth.admit_stream(message)
-        if message.protocol != m.PROTOCOL or role is None:
-            code, why = ("forbidden", "this node needs a token") if role is None else ("bad request", f"this node speaks {m.PROTOCOL}")
-            await self._send(m.Refused(0, code, why))  # type: ignore[arg-type]
+        if message.protocol != m.PROTOCOL:
+            await self._send(m.Refused(0, "bad request", f"this node speaks {m.PROTOCOL}"))
+            return False
+        if role is None:
+            await self._send(m.Refused(0, "forbidden", "this node needs a token"))
             return False
         self._codec = message.codecs[0]
         await self._send(m.Welcome(role))
@@ -242,8 +250,12 @@ class Connection:
         if look.max_wait_s is not None:
             affordable = self._rate.budget_bytes(look.max_wait_s)
             budget = affordable if budget is None else min(budget, affordable)
-        newer: Callable[[], bool] = lambda: self._look is not None or self._running_look is not look  # noqa: E731
-        return await self._exhibits.work(partial(plan_update, bound.scan, bound.state, look, self._codec, budget, newer))
+
+        def superseded() -> bool:
+            return self._look is not None or self._running_look is not look
+
+        job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded)
+        return await self._exhibits.work(job)
 
     async def _send_update(self, bound: _Bound, look: m.Look, update: Update, spent_s: float) -> None:
         bound.state = update.state

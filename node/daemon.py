@@ -9,7 +9,6 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import AsyncExitStack
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -55,7 +54,8 @@ async def start_node(config: Config, stack: AsyncExitStack) -> str:
     server = NodeServer(config, info, exhibits, capture)
     host, port = await server.start()
     stack.push_async_callback(server.stop)
-    announce.append(partial(asyncio.get_running_loop().call_soon_threadsafe, server.publish))
+    loop = asyncio.get_running_loop()
+    announce.append(lambda scan_id: loop.call_soon_threadsafe(server.publish, scan_id))
     if capture is not None:
         capture.start()
         stack.push_async_callback(asyncio.to_thread, capture.stop)

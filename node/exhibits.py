@@ -1,4 +1,4 @@
-"""The library as streams and requests use it: scans opened once, first views encoded once, work done off the event loop."""
+"""The library as clients use it: scans opened once, first views encoded once, work done off the event loop."""
 
 from __future__ import annotations
 

@@ -104,8 +104,8 @@ class _Planner:
         """Choose, encode and note the refinements."""
         explicit = self._look.parameters
         if explicit is not None:
-            self._take(explicit.range and self._code_range(explicit.range))
-            self._take(explicit.texture and self._code_texture(explicit.texture))
+            self._take(self._code_range(explicit.range) if explicit.range else None)
+            self._take(self._code_texture(explicit.texture) if explicit.texture else None)
             return
         self._refine_range()
         self._refine_texture()

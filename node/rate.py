@@ -40,7 +40,7 @@ class RateControl:
         self._encode_s.append(seconds)
 
     def acknowledged(self, size_bytes: int, elapsed_s: float, apply_s: float) -> None:
-        """An update of size_bytes was acknowledged elapsed_s after its first byte was sent, apply_s of it spent applying."""
+        """size_bytes were acknowledged elapsed_s after the first was sent; apply_s of that went into applying them."""
         self._apply_s = apply_s
         travel_s = elapsed_s - apply_s - self.round_trip_s
         if size_bytes < SAMPLE_BYTES_MIN:

@@ -17,7 +17,7 @@ from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask, encode_range
 from protocol.grid import VOID, StepArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
-from protocol.lattice import Channel, Parameters, build_lattice
+from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
 from protocol.reconstruct import Selection, content_hashes, cut, dequantise, quantise, range_patch, select
 from protocol.region import Region

@@ -91,7 +91,8 @@ def region_mse(scan: Scan, selection: Selection, region: Region, texels: ImageAr
                 continue
             offset = source.start - columns.start
             made = patch[top - rows.start : bottom - rows.start, inside.start + offset : inside.stop + offset]
-            total += cv2.norm(np.ascontiguousarray(made), np.ascontiguousarray(scan.texture[top:bottom, inside]), cv2.NORM_L2SQR)
+            truth = np.ascontiguousarray(scan.texture[top:bottom, inside])
+            total += cv2.norm(np.ascontiguousarray(made), truth, cv2.NORM_L2SQR)
             count += made.size
     return total / count if count else 0.0
 

@@ -26,7 +26,9 @@ def range_samples(scan: Scan, selection: Selection) -> StepArray:
 def void_cells(scan: Scan, selection: Selection) -> BoolArray:
     """Which cells of the selection's rectangle are adopted and void. (rows, columns) bool."""
     void = np.asarray(cut(scan.range_steps, selection)) == VOID
-    return void & selection.adopted_cells() if not selection.adopted.all() else void
+    if not selection.adopted.all():
+        void &= selection.adopted_cells()
+    return np.asarray(void, np.bool_)
 
 
 def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
@@ -36,7 +38,8 @@ def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
     spacing = lattice.parameters.half_spacing
     texels = np.empty((*(axis.border.size - 1 for axis in (y, x)), 3), np.uint8)
     core_y, core_x = y.plateau(spacing), x.plateau(spacing)
-    texels[core_y, core_x] = _plateau_means(scan, y.border[core_y.start : core_y.stop + 1], x.border[core_x.start : core_x.stop + 1], spacing)
+    core_borders = y.border[core_y.start : core_y.stop + 1], x.border[core_x.start : core_x.stop + 1]
+    texels[core_y, core_x] = _plateau_means(scan, *core_borders, spacing)
     for rows in (slice(0, core_y.start), slice(core_y.stop, texels.shape[0])):
         _fill_skirt(scan, texels, y, x, rows, slice(0, texels.shape[1]))
     for columns in (slice(0, core_x.start), slice(core_x.stop, texels.shape[1])):
@@ -45,7 +48,7 @@ def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
 
 
 class _Cells:
-    """The run of one axis' cells round the wanted ones. border (n + 1,) in half texels; wanted: indices into the run."""
+    """One axis' cells round the wanted ones. border : (n + 1,) half texels.  wanted : indices into them."""
 
     def __init__(self, axis: Axis, sample: IntArray) -> None:
         self.border = axis.border[sample[0] : sample[-1] + 2]
@@ -68,10 +71,11 @@ def _plateau_means(scan: Scan, y: IntArray, x: IntArray, half_spacing: int) -> I
     if rows < 1 or columns < 1:
         return np.empty((max(rows, 0), max(columns, 0), 3), np.uint8)
     step = half_spacing // 2
-    if half_spacing in (2, 4, 8, 16) and not (y[0] % half_spacing or x[0] % half_spacing or scan.spec.texture_width % step):
-        level = scan.pyramid[step.bit_length() - 1] if step.bit_length() <= len(scan.pyramid) else None
-        if level is not None and y[-1] <= 2 * scan.spec.texture_height:
-            return _crop(level, int(y[0]) // half_spacing, rows, int(x[0]) // half_spacing, columns)
+    on_pyramid = half_spacing in (2, 4, 8, 16) and step.bit_length() <= len(scan.pyramid)
+    aligned = not (y[0] % half_spacing or x[0] % half_spacing or scan.spec.texture_width % step)
+    if on_pyramid and aligned and y[-1] <= 2 * scan.spec.texture_height:
+        level = scan.pyramid[step.bit_length() - 1]
+        return _crop(level, int(y[0]) // half_spacing, rows, int(x[0]) // half_spacing, columns)
     even_rows, even_columns = rows + rows % 2, columns + columns % 2  # so that cells of 1.5 texels end on whole ones
     source = _crop(
         scan.texture, int(y[0]) // 2, even_rows * half_spacing // 2, int(x[0]) // 2, even_columns * half_spacing // 2

@@ -1,4 +1,4 @@
-"""HTTP and the stream on one port: what clients may ask, turned into calls on the library, the scanner and connections."""
+"""HTTP and the stream on one port: what clients may ask, turned into calls on library, scanner and connections."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import asdict
 
 import msgspec
 from aiohttp import web
+from aiohttp.typedefs import Handler
 
 from node.auth import Auth, require
 from node.capture import Capture
@@ -83,7 +84,8 @@ class NodeServer:
     # -- what may be asked -----------------------------------------------------------------------------------------
 
     async def _page(self, request: web.Request) -> web.Response:
-        return web.Response(text=f"foveascan node {self._info.name}: use the command `foveascan look --node {request.url.origin()}`\n")
+        how = f"foveascan look --node {request.url.origin()}"
+        return web.Response(text=f"foveascan node {self._info.name}: use the command `{how}`\n")
 
     async def _health(self, request: web.Request) -> web.Response:
         return _json({"status": "ready", "capture": self._capture_status()})
@@ -166,10 +168,10 @@ async def _harden(request: web.Request, response: web.StreamResponse) -> None:
 
 
 @web.middleware
-async def _explain(request: web.Request, handler: web.RequestHandler) -> web.StreamResponse:  # type: ignore[type-arg]
+async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse:
     """Errors as one JSON object: what is wrong, and where it can be known, the cure."""
     try:
-        return await handler(request)  # type: ignore[operator,no-any-return]
+        return await handler(request)
     except LibraryError as error:
         return _json({"error": str(error)}, status=404)
     except web.HTTPException as error:

@@ -53,7 +53,7 @@ def region_round(u: float, v: float, share: float, width: int, height: int) -> R
 
 
 def _odd(side: float, limit: int) -> int:
-    """The odd number nearest to a side, within 1..limit (the limit itself where that is even and everything is asked)."""
+    """The odd number nearest to a side, at least 1; the limit itself where everything is asked for."""
     if side >= limit:
         return limit
     return min(max(2 * round((side - 1) / 2) + 1, 1), limit)
