@@ -64,6 +64,13 @@ FOLDS: tuple[tuple[tuple[Point, ...], float, float], ...] = (
     (((21, -1), (28, -5.5), (36, -6.5), (44, -4)), 2.4, -0.5),  # under the eye
     (((29, -51), (33, -57), (34, -64)), 1.2, -0.7),
 )
+# centre (s, z), sigma [mm], share of lost answers: behind the ears, under the chin, in the nostrils.
+DOUBTS: tuple[tuple[Point, Point, float], ...] = (
+    ((178, 2), (9, 28), 0.68),
+    ((0, -98), (32, 6.5), 0.66),
+    ((50, -90), (20, 6.5), 0.52),
+    ((7, -32), (3, 1.6), 0.4),
+)
 
 
 def head(shape: Shape, seed: int) -> Grid:
@@ -121,15 +128,6 @@ def unseen_cells(range_mm: Plane, sheet: Sheet, seed: int) -> NDArray[np.bool_]:
             add_bump(doubt, sheet, side, sigma, amount)
     ragged = 0.17 * fractal_noise(rng, (24, 48), sheet.shape, 5, 0.75)
     return np.asarray((doubt + ragged > UNSEEN) | np.isnan(range_mm))
-
-
-# centre, sigma [mm], share of lost answers: behind the ears, under the chin, in the nostrils.
-DOUBTS: tuple[tuple[Point, Point, float], ...] = (
-    ((178, 2), (9, 28), 0.68),
-    ((0, -98), (32, 6.5), 0.66),
-    ((50, -90), (20, 6.5), 0.52),
-    ((7, -32), (3, 1.6), 0.4),
-)
 
 
 def _sides(centre: Point) -> tuple[Point, ...]:

@@ -18,6 +18,7 @@ def lattice_noise(rng: np.random.Generator, cells: tuple[int, int], shape: tuple
 
     Columns wrap: `shape[1]` must be a multiple of 8 (every size class is).
     """
+    # Drawn even where it is left out: what comes next must not depend on the size.
     lattice = rng.standard_normal(cells, dtype=np.float32)
     if 2 * shape[0] < cells[0] or 2 * shape[1] < cells[1]:
         return np.zeros(shape, np.float32)
