@@ -2,11 +2,11 @@
 
 What stands in front of the entropy-coded data follows from (shape, Q), but for the Huffman tables: the quantisation
 tables of Annex K scaled by the Independent JPEG Group's rule, one scan, no restarts. Huffman tables fitted to the image
-save 12 to 30% of the data and take about 150 bytes, so they travel where they pay; the tables of Annex K do not. A payload is
+save 5 to 30% of the data and take about 150 bytes, so they travel where they pay; those of Annex K never do. A payload:
 
     one DHT segment with the four tables, unless they are Annex K's | entropy-coded data | EOI
 
-and whoever decodes writes SOI APP0 DQT DQT SOF0 in front of it and SOS behind the tables, byte for byte as libjpeg does.
+and whoever decodes writes SOI APP0 DQT DQT SOF0 in front of it and SOS behind the tables, as libjpeg does.
 A sender cannot lie about a size in headers that it does not write.
 """
 
@@ -32,11 +32,10 @@ def encode(image: ImageArray, jpeg_q: int) -> bytes:
 
     Raises CodecError when the encoder writes headers that `decode` would not rebuild.
     """
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    payload = _encode(bgr, jpeg_q, fit_tables=True)
+    payload = _encode(image, jpeg_q, fit_tables=True)
     if len(payload) >= _SMALL_BYTES:
         return payload
-    return min(payload, _encode(bgr, jpeg_q, fit_tables=False), key=len)
+    return min(payload, _encode(image, jpeg_q, fit_tables=False), key=len)
 
 
 def decode(payload: bytes, shape: tuple[int, int], jpeg_q: int) -> ImageArray:
@@ -50,7 +49,7 @@ def decode(payload: bytes, shape: tuple[int, int], jpeg_q: int) -> ImageArray:
         raise CodecError(f"JPEG does not decode: {error}") from error
     if image.shape != (*shape, 3) or image.dtype != np.uint8:
         raise CodecError(f"JPEG decoded to {image.shape} {image.dtype}, not {(*shape, 3)} uint8")
-    return image  # type: ignore[no-any-return]
+    return image
 
 
 def restore(payload: bytes, shape: tuple[int, int], jpeg_q: int) -> bytes:
@@ -82,14 +81,15 @@ def quantisation(base: bytes, jpeg_q: int) -> bytes:
     return bytes(min(max((step * scale + 50) // 100, 1), 255) for step in base)
 
 
-def _encode(bgr: ImageArray, jpeg_q: int, fit_tables: bool) -> bytes:
+def _encode(image: ImageArray, jpeg_q: int, fit_tables: bool) -> bytes:
     settings = (
         (cv2.IMWRITE_JPEG_QUALITY, jpeg_q),
         (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
         (cv2.IMWRITE_JPEG_OPTIMIZE, int(fit_tables)),
     )
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, buffer = cv2.imencode(".jpg", bgr, [number for setting in settings for number in setting])
-    return _strip(buffer.tobytes(), frame_header(bgr.shape[:2], jpeg_q))
+    return _strip(buffer.tobytes(), frame_header(image.shape[:2], jpeg_q))
 
 
 def _strip(stream: bytes, head: bytes) -> bytes:

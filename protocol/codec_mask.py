@@ -1,15 +1,16 @@
 """The void mask: which samples of a window were not measured.
 
-Void regions are few and their edges run on from row to row, so what travels is how the edges move. A row's edges are the
-columns where the mask differs from its left neighbour (from false, in column 0). A band is a run of rows with equally
-many edges. The message is a list of numbers, deflated without a wrapper:
+Void regions are few and their edges run on from row to row, so what travels is how the edges move. A row's edges are
+the columns where the mask differs from its left neighbour (from false, in column 0). A band is a run of rows with
+equally many edges. The message is a list of numbers, deflated without a wrapper:
 
     (rows, edges) of each band from the top, until the rows add up to h;
     the edges of each band's first row, left to right, as distances from the edge before (the first from column 0);
     each band's moves, edge by edge and down the rows: 2m for m columns to the right, 2m - 1 for m to the left.
 
-Where that would take more than h w / 8 bytes before deflating (noise), a zero byte and the mask's bits travel instead,
-row by row, most significant first. A mask without a true sample is an empty payload.
+each as an unsigned little-endian varint (seven bits a byte). Where that takes more bytes than the mask has bits / 8
+(noise), a zero byte and the bits, row by row, the most significant first, are deflated instead. A mask without a true
+sample is an empty payload.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import zlib
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.errors import CodecError
 from protocol.grid import BoolArray, IntArray
@@ -96,8 +96,9 @@ def _bands(numbers: IntArray, shape: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def _mark(edges: BoolArray, paths: IntArray) -> None:
-    """Set the edges (rows, w) that paths (edges, rows) names; they stay inside and in order."""
-    if paths.size and not (paths[0].min() >= 0 and paths[-1].max() < edges.shape[1] and (np.diff(paths, axis=0) > 0).all()):
+    """Set the edges (rows, w) that paths (edges, rows) name. Raises CodecError for paths outside or out of order."""
+    inside = not paths.size or (paths[0].min() >= 0 and paths[-1].max() < edges.shape[1])
+    if not inside or (np.diff(paths, axis=0) <= 0).any():
         raise CodecError("mask has edges outside it or out of order")
     edges[np.arange(len(edges)), paths] = True
 
