@@ -17,7 +17,9 @@ from protocol.grid import Grid
 def check_suffix(path: str | Path) -> None:
     """Raises ExportError when a file of this name cannot be written, before any work is done for it."""
     if Path(path).suffix.lower() not in WRITERS:
-        raise ExportError(f"{path}: cannot write {Path(path).suffix or 'a file without suffix'}; use {', '.join(WRITERS)}")
+        raise ExportError(
+            f"{path}: cannot write {Path(path).suffix or 'a file without suffix'}; use {', '.join(WRITERS)}"
+        )
 
 
 def write_grid(grid: Grid, path: str | Path) -> None:

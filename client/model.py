@@ -19,7 +19,7 @@ from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, 
 from protocol.errors import CodecError, LatticeError, RemoteWireError
 from protocol.grid import VOID, BoolArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
 from protocol.holdings import ChannelHoldings, Holdings, range_rank, texture_rank
-from protocol.lattice import Channel, Parameters, build_lattice
+from protocol.lattice import Channel, build_lattice
 from protocol.messages import ScanInfo, Statement
 from protocol.reconstruct import (
     Selection,
@@ -33,7 +33,6 @@ from protocol.reconstruct import (
     texture_patch,
 )
 from protocol.refinement import Generator, Refinement
-
 
 Codec = TypeVar("Codec", RangeCodec, TextureCodec)
 Array = TypeVar("Array", NDArray[np.float32], StepArray, ImageArray)
@@ -58,31 +57,33 @@ class Model:
         self.spec = info.spec()
         self.shapes = info.shapes()
         self.holdings = Holdings.coarse(self.shapes)
-        self._dense: dict[Channel, StepArray | ImageArray] = {}
+        self._steps: StepArray = np.zeros((info.height, info.width), np.uint16)
+        self._texels: ImageArray = np.zeros((info.texture_height, info.texture_width, 3), np.uint8)
+        self._viewed: set[Channel] = set()
         self._range_mm: NDArray[np.float32] | None = None
         self._spacing: NDArray[np.float32] | None = None
 
     @property
     def complete(self) -> bool:
         """The first view of both channels is in."""
-        return len(self._dense) == len(Channel)
+        return len(self._viewed) == len(Channel)
 
     @property
     def range_steps(self) -> StepArray:
         """Range in whole steps, 0 = void. (H, W) uint16, a read-only view that follows later refinements."""
-        return self._view(Channel.RANGE)  # type: ignore[return-value]
+        return _read_only(self._steps.view())
 
     @property
     def range_mm(self) -> NDArray[np.float32]:
         """Distance from the axis, NaN = void. (H, W) float32 [mm], read-only, as of now."""
         if self._range_mm is None:
-            self._range_mm = _read_only(steps_to_mm(self.range_steps, self.spec.step_mm))
+            self._range_mm = _read_only(steps_to_mm(self._steps, self.spec.step_mm))
         return self._range_mm
 
     @property
     def texture(self) -> ImageArray:
         """Colour. (Ht, Wt, 3) uint8 RGB, a read-only view that follows later refinements."""
-        return self._view(Channel.TEXTURE)  # type: ignore[return-value]
+        return _read_only(self._texels.view())
 
     @property
     def spacing(self) -> NDArray[np.float32]:
@@ -97,11 +98,12 @@ class Model:
         return Grid(self.spec, self.range_steps, self.texture)
 
     def export(self, path: str | Path) -> None:
-        """Write the model to a file in the format its suffix names (.npz). Raises ExportError."""
+        """Write the model to a file in the format its suffix names (.npz). Raises ExportError, OSError."""
         write_grid(self.grid, path)
 
-    def statement(self) -> Statement:
-        """Its holdings as they travel."""
+    def state(self) -> Statement:
+        """Its holdings as they travel. From here on the digest counts anew, as it does at the node (F-09c)."""
+        self.holdings.content = 0
         return Statement(*(self.holdings.channels[channel].to_runs() for channel in Channel))
 
     def apply(self, refinement: Refinement) -> Applied:
@@ -115,77 +117,55 @@ class Model:
             coarse = refinement.generator is Generator.COARSE
             blocks = self._apply_first_view(refinement) if coarse else self._apply_fovea(refinement)
         except (CodecError, LatticeError) as error:
-            raise RemoteWireError(f"refinement {refinement.seq} of {refinement.channel.name.lower()}: {error}") from error
+            raise RemoteWireError(f"{_name(refinement)}: {error}") from error
         return Applied(blocks, time.perf_counter() - started_s)
 
     def _apply_first_view(self, refinement: Refinement) -> IntArray:
         channel = refinement.channel
-        if channel in self._dense:
-            raise RemoteWireError(f"a second first view of {channel.name.lower()}")
+        if channel in self._viewed:
+            raise RemoteWireError(f"{_name(refinement)}: a second first view")
         shape = self.shapes[channel]
-        samples = self._decode(refinement, (shape.coarse_height, shape.coarse_width))
+        coarse_shape = shape.coarse_height, shape.coarse_width
+        if refinement.samples != shape.coarse_height * shape.coarse_width:
+            raise RemoteWireError(f"{_name(refinement)}: {refinement.samples} samples for {coarse_shape}")
         if channel is Channel.RANGE:
-            coarse = dequantise(samples, refinement.quality)
-            coarse[decode_mask(refinement.mask, coarse.shape)] = VOID
-            self._dense[channel] = coarse_to_range(coarse, shape)
+            coarse = _decode_range(refinement, coarse_shape)
+            _apply_mask(refinement, coarse)
+            self._steps = coarse_to_range(coarse, shape)
+            self._range_mm = None
         else:
-            self._dense[channel] = coarse_to_texture(samples, shape)
-        self._range_mm = None
+            self._texels = coarse_to_texture(_decode_texture(refinement, coarse_shape), shape)
+        self._viewed.add(channel)
         return np.arange(shape.blocks[0] * shape.blocks[1])
 
     def _apply_fovea(self, refinement: Refinement) -> IntArray:
         if not self.complete:
-            raise RemoteWireError("a fovea before the first view")
-        channel, parameters = refinement.channel, refinement.parameters
-        assert parameters is not None  # Refinement.from_bytes sees to it
-        held = self.holdings.channels[channel]
-        rank = _rank(refinement)
-        selection, adopted = self._select(refinement, parameters, rank)
-        patch = self._patch(refinement, selection)
-        if refinement.self_contained:
-            selection, adopted = _only_finer(selection, adopted, held, rank)
-        paste(self._dense[channel], patch, selection)
-        held.adopt(selection.lattice, adopted, rank)
+            raise RemoteWireError(f"{_name(refinement)}: a fovea before the first view")
+        selection, adopted = self._select(refinement)
         blocks = selection.adopted_blocks()
-        if channel is Channel.RANGE:
-            self.holdings.add_content(blocks, content_hashes(patch, selection))
+        if refinement.channel is Channel.RANGE:
+            steps = range_patch(selection, _decode_range(refinement, selection.sample_shape))
+            _apply_mask(refinement, steps)
+            paste(self._steps, steps, selection)
+            self.holdings.add_content(blocks, content_hashes(steps, selection))
             self._range_mm = self._spacing = None
+        else:
+            texels = _decode_texture(refinement, selection.sample_shape)
+            paste(self._texels, texture_patch(selection, texels), selection)
+        self.holdings.channels[refinement.channel].adopt(selection.lattice, adopted, _rank(refinement))
         return blocks
 
-    def _select(self, refinement: Refinement, parameters: Parameters, rank: int) -> tuple[Selection, BoolArray]:
-        """Which samples these are, from the same parameters and holdings as the node had."""
+    def _select(self, refinement: Refinement) -> tuple[Selection, BoolArray]:
+        """Which samples arrived and which blocks they may change, from the parameters and holdings the node had too."""
+        assert refinement.parameters is not None  # Refinement.from_bytes sees to it
         shape = self.shapes[refinement.channel]
-        held = self.holdings.channels[refinement.channel]
+        held, rank = self.holdings.channels[refinement.channel], _rank(refinement)
         planned_over = ChannelHoldings.coarse(shape) if refinement.self_contained else held
-        chosen = select(build_lattice(shape, parameters), planned_over, rank)
+        chosen = select(build_lattice(shape, refinement.parameters), planned_over, rank)
         expected = chosen[0].samples if chosen else 0
         if chosen is None or expected != refinement.samples:
-            raise HoldingsDiffer(f"refinement {refinement.seq} carries {refinement.samples} samples, not {expected}")
-        return chosen
-
-    def _patch(self, refinement: Refinement, selection: Selection) -> StepArray | ImageArray:
-        """Dense samples of the selection's rectangle, voids applied."""
-        samples = self._decode(refinement, selection.sample_shape)
-        if refinement.channel is Channel.TEXTURE:
-            return texture_patch(selection, samples)
-        patch = range_patch(selection, dequantise(samples, refinement.quality))
-        if refinement.mask:
-            patch[decode_mask(refinement.mask, patch.shape)] = VOID
-        return patch
-
-    def _decode(self, refinement: Refinement, shape: tuple[int, int]) -> StepArray | ImageArray:
-        if refinement.samples != shape[0] * shape[1]:
-            raise RemoteWireError(f"refinement {refinement.seq} carries {refinement.samples} samples, not {shape}")
-        if refinement.channel is Channel.RANGE:
-            _rank(refinement)
-            return decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape)
-        if refinement.mask:
-            raise RemoteWireError("texture has no voids of its own")
-        codec = _codec(TextureCodec, refinement.codec)
-        return decode_texture(refinement.payload, codec, refinement.quality, shape)
-
-    def _view(self, channel: Channel) -> StepArray | ImageArray:
-        return _read_only(self._dense[channel].view())
+            raise HoldingsDiffer(f"{_name(refinement)}: {refinement.samples} samples, {expected} expected")
+        return _only_finer(*chosen, held, rank) if refinement.self_contained else chosen
 
 
 def spacing_of_levels(held: ChannelHoldings) -> NDArray[np.float32]:
@@ -195,9 +175,31 @@ def spacing_of_levels(held: ChannelHoldings) -> NDArray[np.float32]:
     return np.repeat(np.repeat(spacing, side, axis=0)[: shape.height], side, axis=1)[:, : shape.width]
 
 
+def _decode_range(refinement: Refinement, shape: tuple[int, int]) -> StepArray:
+    """Transmitted range in steps, without voids."""
+    values = decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape)
+    return dequantise(values, refinement.quality)
+
+
+def _decode_texture(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:
+    if refinement.mask:
+        raise RemoteWireError(f"{_name(refinement)}: texture has no voids of its own")
+    codec = _codec(TextureCodec, refinement.codec)
+    return decode_texture(refinement.payload, codec, refinement.quality, shape)
+
+
+def _apply_mask(refinement: Refinement, steps: StepArray) -> None:
+    if refinement.mask:
+        steps[decode_mask(refinement.mask, (steps.shape[0], steps.shape[1]))] = VOID
+
+
 def _rank(refinement: Refinement) -> int:
     rank_of = range_rank if refinement.channel is Channel.RANGE else texture_rank
     return rank_of(refinement.quality)
+
+
+def _name(refinement: Refinement) -> str:
+    return f"refinement {refinement.seq} ({refinement.channel.name.lower()})"
 
 
 def _codec(kind: type[Codec], number: int) -> Codec:

@@ -14,12 +14,14 @@ from protocol.lattice import Channel, Parameters
 from protocol.messages import Updated
 from protocol.refinement import Refinement
 
+ChannelName = Literal["range", "texture"]
+
 
 @dataclass(frozen=True, slots=True)
 class Sent:
     """One refinement as it travelled. quality : range, quantum in steps; texture, 0..255. codec : id on the wire."""
 
-    channel: Literal["range", "texture"]
+    channel: ChannelName
     parameters: Parameters
     quality: int
     codec: int
@@ -42,7 +44,7 @@ class Update:
     elapsed_s : from asking until the model held it.       apply_s : of which decoding and reconstruction.
     error_max_mm, texture_db : what the node says is reached in the window; None where it did not look.
     parameters : the refinements that travelled.
-    changed : dense blocks overwritten, "range" and "texture", flat indices in row order, (n,) int64, ascending, once each.
+    changed : dense blocks overwritten, by "range" and "texture": flat indices in row order, (n,) int64, ascending.
     lost : refinements that could not be applied; the node has been told what we hold, ask again.
     encodes, node_ms : images the node coded for it, and the time it spent.
     """
@@ -57,7 +59,7 @@ class Update:
     error_max_mm: float | None
     texture_db: float | None
     parameters: tuple[Sent, ...]
-    changed: dict[str, IntArray]
+    changed: dict[ChannelName, IntArray]
     lost: int
     encodes: int
     node_ms: float
@@ -85,29 +87,30 @@ class Tally:
         self.blocks[refinement.channel].append(applied.blocks)
         self.apply_s += applied.apply_s
 
-    def close(self, reason: Literal["complete", "byte limit", "superseded"], said: Updated | None, lost: int) -> Update:
-        """The update; `said` is the node's own closing message, None when only a newer look's answer closed this one."""
-        changed = {
-            channel_name(c): np.unique(np.concatenate([np.zeros(0, np.int64), *self.blocks[c]])) for c in Channel
-        }
+    def close(self, said: Updated, lost: int = 0) -> Update:
+        """The update, with the node's closing message."""
         return Update(
             request=self.request,
-            reason=reason,
+            reason=said.reason,
             bytes_received=self.bytes_received,
             payload_bytes=sum(sent.payload_bytes for sent in self.sent),
             samples=sum(sent.samples for sent in self.sent),
             elapsed_s=time.perf_counter() - self.started_s,
             apply_s=self.apply_s,
-            error_max_mm=said.error_max_mm if said else None,
-            texture_db=said.texture_db if said else None,
+            error_max_mm=said.error_max_mm,
+            texture_db=said.texture_db,
             parameters=tuple(self.sent),
-            changed=changed,
+            changed={channel_name(channel): self._changed(channel) for channel in Channel},
             lost=lost,
-            encodes=said.encodes if said else 0,
-            node_ms=said.node_ms if said else 0.0,
+            encodes=said.encodes,
+            node_ms=said.node_ms,
         )
 
+    def _changed(self, channel: Channel) -> IntArray:
+        blocks = self.blocks[channel]
+        return np.unique(np.concatenate(blocks)) if blocks else np.zeros(0, np.int64)
 
-def channel_name(channel: Channel) -> Literal["range", "texture"]:
+
+def channel_name(channel: Channel) -> ChannelName:
     """The channel's name in the public interface."""
     return "range" if channel is Channel.RANGE else "texture"

@@ -1,0 +1,192 @@
+"""The subcommands `discover` and `look`: a headless client."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+    from client.discover import NodeAddress
+    from client.session import Session
+    from client.update import Update
+
+CENTRE = (0.5, 0.5)
+
+
+def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Offer `discover` and `look`."""
+    finder = subparsers.add_parser("discover", help="list the nodes on this network")
+    _add_common(finder)
+    finder.add_argument("--name", help="stop at the node of this name or id")
+    finder.set_defaults(run=run_discover)
+
+    looker = subparsers.add_parser("look", help="open a scan and get detail where you look")
+    _add_common(looker)
+    looker.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
+    looker.add_argument("--token", help="what the node was paired with")
+    looker.add_argument("--scan", default="latest", metavar="ID", help="which scan (latest)")
+    looker.add_argument(
+        "--at", type=_click, nargs="+", action="extend", metavar="U,V", help="where to look, each in [0, 1) (0.5,0.5)"
+    )
+    looker.add_argument("--window", type=_number, default=0.05, metavar="SHARE", help="share of the area, 0..1 (0.05)")
+    looker.add_argument("--texture-db", type=_number, default=40, metavar="DB", help="PSNR to stop at (40)")
+    looker.add_argument("--range-mm", type=_number, default=0.1, metavar="MM", help="range error to stop at (0.1)")
+    looker.add_argument("--max-wait", type=_number, metavar="S", help="seconds a look may take")
+    looker.add_argument("--max-bytes", type=int, metavar="N", help="bytes a look may take")
+    looker.add_argument("-o", "--output", metavar="FILE", help="write the model; the suffix is the format (.npz)")
+    looker.set_defaults(run=run_look)
+
+
+def run_discover(args: argparse.Namespace) -> int:
+    """Print the nodes that answer; status 1 when none does."""
+    import asyncio
+
+    from client.discover import discover
+
+    with _progress(args, 1, "searching") as bar:
+        nodes = asyncio.run(discover(args.timeout, args.name))
+        bar.update()
+    for node in nodes:
+        _print(args, _node_record(node), f"{node.url}  {node.name}  {node.state}")
+    if not nodes:
+        raise _no_node(args.timeout)
+    return 0
+
+
+def run_look(args: argparse.Namespace) -> int:
+    """Open a scan, look at each place, print what came of it."""
+    import asyncio
+
+    from client.export import check_suffix
+
+    if args.output:
+        check_suffix(args.output)
+    asyncio.run(_look(args))
+    return 0
+
+
+async def _look(args: argparse.Namespace) -> None:
+    from client.session import connect
+
+    clicks = args.at or [CENTRE]
+    with _progress(args, 1 + len(clicks), "looking") as bar:
+        async with connect(args.node or await _only_node(args.timeout), token=args.token) as session:
+            model = await session.open(args.scan)
+            bar.update()
+            s = model.info
+            shape = [s.height, s.width], [s.texture_height, s.texture_width]
+            first_view_bytes = session.stats.bytes_received
+            record = {"scan": s.id, "range": shape[0], "texture": shape[1], "first_view_bytes": first_view_bytes}
+            _print(args, record, f"scan {s.id}: {s.width} x {s.height}, first view {first_view_bytes} bytes")
+            for u, v in clicks:
+                update = await _look_at(session, args, u, v)
+                bar.update()
+                _print(args, _update_record(u, v, update), _update_line(u, v, update))
+    if args.output:
+        model.export(args.output)
+
+
+async def _look_at(session: Session, args: argparse.Namespace, u: float, v: float) -> Update:
+    return await session.look(
+        u,
+        v,
+        window=args.window,
+        texture_db=args.texture_db,
+        range_mm=args.range_mm,
+        max_wait_s=args.max_wait,
+        max_bytes=args.max_bytes,
+    )
+
+
+async def _only_node(timeout_s: float) -> NodeAddress:
+    """The one node on this network."""
+    from client.discover import discover
+    from client.errors import NodeLost
+
+    nodes = await discover(timeout_s)
+    if not nodes:
+        raise _no_node(timeout_s)
+    if len(nodes) > 1:
+        raise NodeLost(f"{len(nodes)} nodes answer; choose one: --node {' or '.join(node.url for node in nodes)}")
+    return nodes[0]
+
+
+def _no_node(timeout_s: float) -> Exception:
+    from client.errors import NodeLost
+
+    return NodeLost(f"no node answered within {timeout_s:g} s; start one with `foveascan serve`, or name it: --node URL")
+
+
+def _node_record(node: NodeAddress) -> dict[str, Any]:
+    return {"name": node.name, "id": node.id, "state": node.state, "url": node.url, "tls": node.tls}
+
+
+def _update_record(u: float, v: float, update: Update) -> dict[str, Any]:
+    return {
+        "u": u,
+        "v": v,
+        "reason": update.reason,
+        "bytes": update.bytes_received,
+        "samples": update.samples,
+        "elapsed_s": round(update.elapsed_s, 4),
+        "error_max_mm": update.error_max_mm,
+        "texture_db": update.texture_db,
+    }
+
+
+def _update_line(u: float, v: float, update: Update) -> str:
+    reached = [f"{update.bytes_received} bytes", f"{update.elapsed_s:.3f} s"]
+    if update.error_max_mm is not None:
+        reached.append(f"range within {update.error_max_mm:.3g} mm")
+    if update.texture_db is not None:
+        reached.append(f"texture {update.texture_db:.1f} dB")
+    return f"({u:g}, {v:g}): {update.reason}, {', '.join(reached)}"
+
+
+def _print(args: argparse.Namespace, record: dict[str, Any], line: str) -> None:
+    from tqdm import tqdm
+
+    tqdm.write(json.dumps(record) if args.json else line)
+
+
+def _progress(args: argparse.Namespace, total: int, what: str) -> tqdm[Any]:
+    """A bar on standard error where that is a terminal."""
+    from tqdm import tqdm
+
+    return tqdm(total=total, desc=what, leave=False, disable=True if args.json else None)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
+    parser.add_argument("--timeout", type=_seconds, default=3.0, metavar="S", help="seconds to search for nodes (3)")
+
+
+def _click(text: str) -> tuple[float, float]:
+    u, separator, v = text.partition(",")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"expected U,V, got {text!r}")
+    click = _number(u), _number(v)
+    if not all(0 <= coordinate < 1 for coordinate in click):
+        raise argparse.ArgumentTypeError(f"u and v must be in [0, 1), got {text}")
+    return click
+
+
+def _number(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"expected a number, got {text!r}")
+    return number
+
+
+def _seconds(text: str) -> float:
+    seconds = _number(text)
+    if not 0 < seconds <= 3600:
+        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text}")
+    return seconds
