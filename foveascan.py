@@ -34,6 +34,9 @@ from contextlib import contextmanager
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import client.command
+import node.command
+import simulators.command
 from protocol.errors import FoveascanError
 
 __version__ = "0.1.0"
@@ -96,6 +99,8 @@ def build_parser() -> argparse.ArgumentParser:
         title="subcommands", metavar="COMMAND", required=True, parser_class=_Parser
     )
     add_own_subcommands(subparsers)
+    for package in (node.command, client.command, simulators.command):
+        package.add_subcommands(subparsers)
     return parser
 
 

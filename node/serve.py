@@ -173,8 +173,8 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
     try:
         return await handler(request)
     except LibraryError as error:
-        return _json({"error": str(error)}, status=404)
+        return _json({"code": "not found", "message": str(error)}, status=404)
     except web.HTTPException as error:
         if error.status < 400:
             raise
-        return _json({"error": error.text}, status=error.status)
+        return _json({"code": (error.reason or "").lower(), "message": error.text}, status=error.status)

@@ -237,7 +237,7 @@ def coarse_to_range(coarse_steps: StepArray, shape: ChannelShape) -> StepArray:
                 weight += share
         rows = np.where(y_part[band] < shape.height, y_low[band], y_high[band])
         void = coarse_steps[np.ix_(rows, columns)] == VOID
-        dense[band] = np.where(void, VOID, _round_ratio(total, np.where(void, 1, weight)))
+        dense[band] = _round_ratio(np.where(void, VOID, total), np.where(void, 1, weight))
     return dense
 
 
