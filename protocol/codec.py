@@ -48,15 +48,16 @@ JPEG_Q = (
 JPEG_QUALITY_MAX = JPEG_QUALITY_MIN + len(JPEG_Q) - 1
 
 
-def encode_texture(image: ImageArray, codec: TextureCodec, quality: int) -> bytes:
+def encode_texture(image: ImageArray, codec: TextureCodec, quality: int, *, quick: bool = False) -> bytes:
     """Payload of an (h, w, 3) uint8 RGB image.
 
     quality : 0..LOSSY_MAX or LOSSLESS for HTJ2K, JPEG_QUALITY_MIN..JPEG_QUALITY_MAX for JPEG.
+    quick : half the time and 5 to 30% more bytes for JPEG, where the link is fast; nothing else differs.
     Raises CodecError for any other quality and for an array that is no such image.
     """
     _check_array(image, np.uint8, 3)
     if codec == TextureCodec.JPEG:
-        return codec_jpeg.encode(image, jpeg_q(quality))
+        return codec_jpeg.encode(image, jpeg_q(quality), quick)
     return codec_htj2k.encode(image, quality)
 
 

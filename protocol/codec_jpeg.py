@@ -2,7 +2,7 @@
 
 What stands in front of the entropy-coded data follows from (shape, Q), but for the Huffman tables: the quantisation
 tables of Annex K scaled by the Independent JPEG Group's rule, one scan, no restarts. Huffman tables fitted to the image
-save 5 to 30% of the data and take about 150 bytes, so they travel where they pay; those of Annex K never do. A payload:
+save 5 to 30% of the data, take about 150 bytes and double the time of encoding; Annex K's never travel. A payload is
 
     one DHT segment with the four tables, unless they are Annex K's | entropy-coded data | EOI
 
@@ -27,11 +27,13 @@ _APP0, _DQT, _SOF0, _DHT, _SOS = b"\xff\xe0", b"\xff\xdb", b"\xff\xc0", b"\xff\x
 _SMALL_BYTES = 1024
 
 
-def encode(image: ImageArray, jpeg_q: int) -> bytes:
-    """Payload of an (h, w, 3) uint8 RGB image, jpeg_q 1..100.
+def encode(image: ImageArray, jpeg_q: int, quick: bool = False) -> bytes:
+    """Payload of an (h, w, 3) uint8 RGB image, jpeg_q 1..100; quick: with Annex K's tables.
 
     Raises CodecError when the encoder writes headers that `decode` would not rebuild.
     """
+    if quick:
+        return _encode(image, jpeg_q, fit_tables=False)
     payload = _encode(image, jpeg_q, fit_tables=True)
     if len(payload) >= _SMALL_BYTES:
         return payload
