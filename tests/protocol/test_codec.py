@@ -173,8 +173,8 @@ def test_small_jpegs_do_without_fitted_tables_and_large_ones_carry_them() -> Non
 def test_a_quick_jpeg_is_larger_and_the_same_image() -> None:
     small, quick = (codec.encode_texture(texture((130, 200)), TextureCodec.JPEG, 40, quick=q) for q in (False, True))
     assert len(small) < len(quick) and not quick.startswith(b"\xff\xc4")
-    images = [codec.decode_texture(payload, TextureCodec.JPEG, 40, (130, 200)) for payload in (small, quick)]
-    np.testing.assert_array_equal(*images)
+    first, second = (codec.decode_texture(payload, TextureCodec.JPEG, 40, (130, 200)) for payload in (small, quick))
+    np.testing.assert_array_equal(first, second)
 
 
 # --- golden vectors
