@@ -134,6 +134,8 @@ class Scanner:
         self._link: ScannerLink | None = None
         self._info: DeviceInfo | None = None
         self._sweep = secrets.randbelow(65535)
+        self._silent_s = 0.0  # spent waiting since a frame was heard; the caller's own pauses do not count
+        self._frames_heard = 0
 
     def hello(self) -> DeviceInfo:
         """Open a session. Raises PortLost, or ScannerFault when nothing answers or it speaks another version."""
@@ -144,20 +146,18 @@ class Scanner:
         self._link = link
         link.tick(self._clock())
         link.greet()
+        self._silent_s = 0.0
         while self._info is None:
             self._info = self._await_greeting()
         return self._info
 
     def calibrate(self) -> Calibration:
         """Home the table. Raises PortLost, or ScannerFault when the scanner refuses, fails or falls silent."""
-        self._command(Calibrate())
+        self._send(Calibrate())
         while True:
-            event = self._heard_event()
-            if isinstance(event, Command):
-                self._greeted.accept(event)
-                if isinstance(event.message, Calibration):
-                    return event.message
-            self._raise_fault(event)
+            report = self._await_command()
+            if isinstance(report, Calibration):
+                return report
 
     def sweep(self, request: SweepRequest, stop: threading.Event | None = None) -> Iterator[SweepEvent]:
         """One sweep, event by event; whatever the scanner was doing is dropped first. Setting `stop` ends it.
@@ -165,9 +165,9 @@ class Scanner:
         Raises PortLost or ScannerFault when it does not even start.
         """
         self._sweep = self._sweep % 65535 + 1
-        for command in (Reset(), request, SweepStart(self._sweep)):
+        for command in (Reset(), request):
             self._command(command)
-        header = self._await_header()
+        header = self._start()
         yield SweepStarted(header)
         yield from self._collect(header, stop or threading.Event())
 
@@ -190,7 +190,7 @@ class Scanner:
                         yield event
                 elif event is not None:
                     yield from collector.take(event)
-                yield from collector.look_up(self._clock(), stop.is_set())
+                yield from collector.look_up(self._clock(), stop.is_set(), self._silent_s)
             self._flush()
         except PortLost as error:
             yield collector.interrupt(str(error), error)
@@ -200,29 +200,26 @@ class Scanner:
 
     def _wave_off(self, sweep: int) -> None:
         """Tell the scanner to stop, without waiting to be heard."""
-        self._greeted.send(SweepStop(sweep))
+        self._send(SweepStop(sweep))
         try:
             self._flush()
         except PortLost:
             return  # nobody is left to be told; the next call on the port says so
 
-    def _await_header(self) -> SweepHeader:
+    def _start(self) -> SweepHeader:
+        """Start the sweep; its header may overtake the answer to the command."""
+        self._send(SweepStart(self._sweep))
         while True:
-            event = self._heard_event()
-            if isinstance(event, Command):
-                self._greeted.accept(event)
-                if isinstance(event.message, SweepHeader) and event.message.sweep == self._sweep:
-                    self._flush()
-                    return event.message
-            self._raise_fault(event)
+            header = self._await_command()
+            if isinstance(header, SweepHeader) and header.sweep == self._sweep:
+                return header
 
     # -- commands ------------------------------------------------------------------------------------------------
 
     def _command(self, command: HostCommand) -> None:
         """Send a command and wait until it is accepted. Raises PortLost or ScannerFault."""
         link = self._greeted
-        link.tick(self._clock())
-        link.send(command)
+        self._send(command)
         while True:
             event = self._next_event(self._clock() + _LOOK_UP_S)
             if isinstance(event, Accepted) and event.message is command:
@@ -230,6 +227,26 @@ class Scanner:
             if isinstance(event, Command):
                 link.accept(event)
             self._raise_fault(event)
+
+    def _await_command(self) -> object:
+        """What the scanner wants next, accepted, or None after a short while.
+
+        Raises PortLost, or ScannerFault when it refuses what we sent, fails, or falls silent.
+        """
+        link = self._greeted
+        event = self._next_event(self._clock() + _LOOK_UP_S)
+        self._raise_fault(event)
+        if isinstance(event, Command):
+            link.accept(event)
+            return event.message
+        if link.commands_pending == 0 and self._silent_s > self._config.quiet_s:
+            raise ScannerFault(f"{self._port.name}: silent for {self._config.quiet_s:g} s")
+        return None
+
+    def _send(self, command: HostCommand) -> None:
+        """Hand a command to the link, which must know the time to count its patience."""
+        self._greeted.tick(self._clock())
+        self._greeted.send(command)
 
     def _await_greeting(self) -> DeviceInfo | None:
         event = self._next_event(self._clock() + _LOOK_UP_S)
@@ -257,13 +274,6 @@ class Scanner:
             raise LocalWireError("say hello first")
         return self._link
 
-    def _heard_event(self) -> Event | None:
-        """The next event, or None after a short while; ScannerFault when the scanner has fallen silent."""
-        event = self._next_event(self._clock() + _LOOK_UP_S)
-        if event is None and self._clock() > self._greeted.heard_s + self._config.quiet_s:
-            raise ScannerFault(f"{self._port.name}: silent for {self._config.quiet_s:g} s")
-        return event
-
     def _next_event(self, until_s: float) -> Event | None:
         """The next event of the link, or None when none came in time. Raises PortLost."""
         link = self._greeted
@@ -278,11 +288,14 @@ class Scanner:
 
     def _read(self, timeout_s: float) -> None:
         """Wait for bytes and hand them to the link."""
+        link, began_s = self._greeted, self._clock()
         data = self._port.read(_READ_BYTES, max(timeout_s, 0.0))
         now_s = self._clock()
+        self._silent_s = self._silent_s + now_s - began_s if link.frames_heard == self._frames_heard else 0.0
+        self._frames_heard = link.frames_heard
         if data:
-            self._greeted.receive_data(data, now_s)
-        self._greeted.tick(now_s)
+            link.receive_data(data, now_s)
+        link.tick(now_s)
 
     def _flush(self) -> None:
         data = self._greeted.data_to_send()
@@ -321,18 +334,17 @@ class _Collector:
         match event:
             case Dropped(count=count):
                 self._tally = replace(self._tally, dropped_bytes=self._tally.dropped_bytes + count)
-            case Unanswered(message):
-                if not isinstance(message, SweepStop):
-                    yield self._break(f"no answer to {type(message).__name__}")
-            case Refused(message, _, text):
-                yield self._break(f"{type(message).__name__} refused: {text}")
+            case Unanswered(RequestColumns()):
+                yield self._break("no answer to a request for missing columns")
+            case Refused(RequestColumns(), _, text):
+                yield self._break(f"a request for missing columns was refused: {text}")
             case WrongVersion(major):
                 yield self._break(f"the scanner speaks link version {major} now")
             case Command(message=message):
                 self._link.accept(event)
                 yield from self._take_command(message)
 
-    def look_up(self, now_s: float, wants_stop: bool) -> Iterator[SweepEvent]:
+    def look_up(self, now_s: float, wants_stop: bool, silent_s: float) -> Iterator[SweepEvent]:
         """What is due by now: stopping, giving up on a silent scanner, progress, asking for lost columns."""
         self._now_s = now_s
         if self.is_over:
@@ -342,13 +354,18 @@ class _Collector:
             self._link.send(SweepStop(self._sweep))
         if self._stop_s is not None and now_s > self._stop_s + self._config.quiet_s:
             yield self.interrupt("stopped", None)
-        elif now_s > self._link.heard_s + self._config.quiet_s:
+        elif self._is_silent(silent_s):
             yield self._break(f"silent for {self._config.quiet_s:g} s")
         elif now_s >= self._progress_s + self._config.progress_s:
             self._progress_s = now_s
             if self._is_live and self._link.commands_pending == 0:
                 self._request(self._ledger.left_behind())
             yield SweepProgress(self._ledger.held / self._ledger.expected, self._received_bytes)
+
+    def _is_silent(self, silent_s: float) -> bool:
+        """Whether we should have heard something by now; a scanner that has ended may be waiting for our request."""
+        is_our_turn = self._held_at_end >= 0 and self._link.commands_pending > 0
+        return silent_s > self._config.quiet_s and not is_our_turn
 
     def interrupt(self, reason: str, cause: DriverError | None) -> SweepInterrupted:
         """The sweep is over, early."""

@@ -166,7 +166,7 @@ class ScannerLink:
             raise LocalWireError(f"a window of {window_bytes} bytes has no room for one frame")
         self.role = role
         self.peer_payload_max = SERIAL_PAYLOAD_MAX
-        self.heard_s = 0.0
+        self.frames_heard = 0
         self._info = info
         self._payload_max = payload_max
         self._window_bytes = window_bytes
@@ -307,7 +307,7 @@ class ScannerLink:
             message = decode_message(frame.type, frame.payload)
         except RemoteWireError as error:
             return self._reject(frame, DropReason.MALFORMED, NakCode.MALFORMED, str(error)[:150])
-        self.heard_s = self._now_s
+        self.frames_heard += 1
         return self._take_message(frame, message)
 
     def _take_message(self, frame: Frame, message: Message) -> Event | None:
@@ -389,7 +389,7 @@ class ScannerLink:
     def _repeat(self, flight: _Flight) -> None:
         if flight.tries == TRIES:
             self._events.append(Unanswered(flight.message))
-            self._land(flight)
+            self._clear_flight()
             return
         flight.tries += 1
         flight.wait_s = min(flight.wait_s * _RETRY_GROWTH, RETRY_MAX_S)
@@ -406,10 +406,15 @@ class ScannerLink:
         return Accepted(flight.message)
 
     def _land(self, flight: _Flight) -> None:
-        """The command in flight is done with: learn from its time unless it was repeated, and send the next."""
-        if flight.tries == 1:
-            took_s = self._now_s - flight.sent_s
-            self._answer_s = took_s if self._answer_s is None else 0.75 * self._answer_s + 0.25 * took_s
+        """The command in flight is answered: learn from its time, and send the next.
+
+        Which of several repetitions was answered nobody can tell; their last wait was long enough, so it counts.
+        """
+        took_s = self._now_s - flight.sent_s if flight.tries == 1 else flight.wait_s
+        self._answer_s = took_s if self._answer_s is None else 0.75 * self._answer_s + 0.25 * took_s
+        self._clear_flight()
+
+    def _clear_flight(self) -> None:
         self._flight = None
         self._launch()
 

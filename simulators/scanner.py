@@ -242,7 +242,8 @@ class SimulatedScanner:
         """STATUS, as long as somebody may be waiting for it."""
         is_starved = self._is_starved()
         due_s = self._status_s + (_STATUS_STARVED_S if is_starved else _STATUS_S)
-        if now_s >= due_s and (is_starved or self.state in (State.HOMING, State.SWEEPING)):
+        is_awaited = is_starved or self._link.commands_pending > 0 or self.state in (State.HOMING, State.SWEEPING)
+        if now_s >= due_s and is_awaited:
             self._status_s = now_s
             sweep = self._sweep.header.sweep if self._sweep is not None else 0
             self._link.send(Status(self.state, sweep, self._table.encoder, self._link.sent_bytes, is_starved))
