@@ -113,11 +113,12 @@ class Parameters:
 class Axis:
     """One axis of a lattice.
 
-    at : (m,) int64 strictly ascending positions, in quarter samples, not wrapped; ring ends and clamped edges included.
+    at : (m,) int64 strictly ascending positions, in quarter samples, not wrapped; with what rings and edges repeat.
     sample : (m,) int64 which of the `count` transmitted samples stands there.
     border : int64 half-sample positions: of samples (range, (count,)), of the cells' borders (texture, (count + 1,)).
     block, start, stop : (b,) int64 the blocks this axis covers: index, first and past-last dense position, not wrapped.
-    gap : (b,) int64 the widest interval each block's stencil touches, in quarter samples.
+    gap : (b,) int64 the widest interval each block's stencil touches, in quarter samples; where it is one sample only,
+    that sample's cell (texture) or a whole sample (range).
     first, last : (b,) int64 the outermost entries of `at` in that stencil.
     """
 
@@ -220,7 +221,7 @@ def _axis_x(shape: ChannelShape, p: Parameters) -> Axis:
     steps = _half_steps(shape, p.half_spacing, p.rho_x, width, shape.coarse_width)
     border = _grow_both(plateau, steps, 2 * (width - 1))
     at = _positions(shape, border)
-    return _cover(at, np.arange(at.size), np.diff(at), border, _turns(shape, (-1, 0, 1)))
+    return _cover(at, np.arange(at.size), border, _turns(shape, (-1, 0, 1)))
 
 
 def _axis_y(shape: ChannelShape, p: Parameters) -> Axis:
@@ -234,8 +235,8 @@ def _axis_y(shape: ChannelShape, p: Parameters) -> Axis:
     below = _until_edge(plateau[-1] + outward, edge) if plateau[-1] < edge else outward[:0]
     above = -_until_edge(-plateau[0] + outward, 0) if plateau[0] > 0 else outward[:0]
     border = np.concatenate([above[::-1], plateau, below])
-    at, sample, interval = _clamp(_positions(shape, border), shape, border)
-    return _cover(at, sample, interval, border, _turns(shape, (0,), vertical=True))
+    at, sample = _repeat_edges(_positions(shape, border), shape, border)
+    return _cover(at, sample, border, _turns(shape, (0,), vertical=True))
 
 
 def _plateau(start: int, stop: int, half_spacing: int) -> IntArray:
@@ -285,21 +286,20 @@ def _ring(shape: ChannelShape, half_spacing: int) -> Axis:
     count, turn = at.size, QUARTERS * shape.width
     sample = np.concatenate([[count - 1], np.arange(count), [0]])
     at = np.concatenate([[at[-1] - turn], at, [at[0] + turn]])
-    return _cover(at, sample, np.diff(at), border, _turns(shape, (0,)))
+    return _cover(at, sample, border, _turns(shape, (0,)))
 
 
-def _clamp(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """At an image edge the outermost cell serves up to the edge itself (texture rows).
-
-    Returns at, sample and the intervals between; the one at the edge counts as wide as its cell is high.
-    """
-    sample, interval, cell = np.arange(at.size), np.diff(at), 2 * np.diff(border)
-    bottom = QUARTERS * (shape.height - 1)
-    if border[0] == 0 and at[0] > 0:
-        at, sample, interval = np.append(0, at), np.append(0, sample), np.append(cell[0], interval)
-    if shape.channel is Channel.TEXTURE and border[-1] == 2 * shape.height and at[-1] < bottom:
-        at, sample, interval = np.append(at, bottom), np.append(sample, sample[-1]), np.append(interval, cell[-1])
-    return at, sample, interval
+def _repeat_edges(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[IntArray, IntArray]:
+    """At an image edge the outermost cell is repeated outside, so that it serves up to the edge (texture rows)."""
+    sample = np.arange(at.size)
+    if shape.channel is Channel.RANGE:
+        return at, sample
+    cell = 2 * np.diff(border)
+    if border[0] == 0:
+        at, sample = np.append(at[0] - cell[0], at), np.append(0, sample)
+    if border[-1] == 2 * shape.height:
+        at, sample = np.append(at, at[-1] + cell[-1]), np.append(sample, sample[-1])
+    return at, sample
 
 
 def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) -> tuple[IntArray, IntArray, IntArray]:
@@ -312,25 +312,24 @@ def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) 
     return np.tile(index, len(turns)), np.tile(start, len(turns)) + offset, np.tile(stop, len(turns)) + offset
 
 
-def _cover(
-    at: IntArray, sample: IntArray, interval: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray]
-) -> Axis:
+def _cover(at: IntArray, sample: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray]) -> Axis:
     """Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches."""
     index, start, stop = blocks
     first = np.searchsorted(at, QUARTERS * start, side="right") - 1
     last = np.searchsorted(at, QUARTERS * (stop - 1), side="left")
     inside = (first >= 0) & (last < at.size)
     index, start, stop, first, last = (a[inside] for a in (index, start, stop, first, last))
-    gap = _widest(interval, first, last)
-    return Axis(at, sample, int(sample.max()) + 1, border, index, start, stop, gap, first, last)
+    count = int(sample.max()) + 1
+    alone = np.full(at.size, QUARTERS) if border.size == count else 2 * np.diff(border)[sample]
+    gap = np.where(last > first, _widest(np.diff(at), first, last), alone[first])
+    return Axis(at, sample, count, border, index, start, stop, np.maximum(gap, QUARTERS), first, last)
 
 
 def _widest(intervals: IntArray, first: IntArray, last: IntArray) -> IntArray:
-    """Largest of intervals[first:last] for each pair; one whole sample where the pair is a single position."""
+    """Largest of intervals[first:last] for each pair; of no meaning where a pair is a single position."""
     touched = np.concatenate([intervals, [0, 0]])
     bounds = np.stack([first, np.maximum(last, first + 1)], axis=1).ravel()
-    widest = np.maximum.reduceat(touched, bounds)[::2] if first.size else first
-    return np.where(last > first, np.maximum(widest, QUARTERS), QUARTERS).astype(np.int64)
+    return np.maximum.reduceat(touched, bounds)[::2] if first.size else first
 
 
 def _listed(shape: ChannelShape, p: Parameters, x: Axis, y: Axis) -> BoolArray:
