@@ -1,4 +1,4 @@
-"""The subcommands `discover` and `look`: a headless client."""
+"""The subcommands `discover`, `scan` and `look`: a headless client."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
+from client import scan_command
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from client.discover import NodeAddress
+    from client.discovery import NodeAddress
     from client.session import Session
     from client.update import Update
 
@@ -18,11 +20,13 @@ CENTRE = (0.5, 0.5)
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Offer `discover` and `look`."""
+    """Offer `discover`, `scan` and `look`."""
     finder = subparsers.add_parser("discover", help="list the nodes on this network")
     _add_common(finder)
     finder.add_argument("--name", help="stop at the node of this name or id")
     finder.set_defaults(run=run_discover)
+
+    scan_command.add_subcommands(subparsers)
 
     looker = subparsers.add_parser("look", help="open a scan and get detail where you look")
     _add_common(looker)
@@ -45,7 +49,7 @@ def run_discover(args: argparse.Namespace) -> int:
     """Print the nodes that answer; status 1 when none does."""
     import asyncio
 
-    from client.discover import discover
+    from client.discovery import discover
 
     with _progress(args, 1, "searching") as bar:
         nodes = asyncio.run(discover(args.timeout, args.name))
@@ -74,7 +78,7 @@ async def _look(args: argparse.Namespace) -> None:
 
     clicks = args.at or [CENTRE]
     with _progress(args, 1 + len(clicks), "looking") as bar:
-        async with connect(args.node or await _only_node(args.timeout), token=args.token) as session:
+        async with connect(args.node or await only_node(args.timeout), token=args.token) as session:
             model = await session.open(args.scan)
             bar.update()
             s = model.info
@@ -102,9 +106,9 @@ async def _look_at(session: Session, args: argparse.Namespace, u: float, v: floa
     )
 
 
-async def _only_node(timeout_s: float) -> NodeAddress:
-    """The one node on this network."""
-    from client.discover import discover
+async def only_node(timeout_s: float) -> NodeAddress:
+    """The one node on this network. Raises NodeLost when none answers within timeout_s, or several do."""
+    from client.discovery import discover
     from client.errors import NodeLost
 
     nodes = await discover(timeout_s)
@@ -118,7 +122,7 @@ async def _only_node(timeout_s: float) -> NodeAddress:
 def _no_node(timeout_s: float) -> Exception:
     from client.errors import NodeLost
 
-    return NodeLost(f"no node answered within {timeout_s:g} s; start one with `foveascan serve`, or name it: --node URL")
+    return NodeLost(f"no node answered within {timeout_s:g} s; start one with `foveascan serve` or use --node")
 
 
 def _node_record(node: NodeAddress) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from weakref import WeakSet
 import aiohttp
 import msgspec
 
-from client.discover import NodeAddress
+from client.discovery import NodeAddress
 from client.errors import NodeLost, RequestRefused
 from client.model import Applied, Model
 from client.news import News
@@ -202,6 +202,10 @@ class Session:
     async def scans(self) -> list[dict[str, Any]]:
         """The scans in the node's library, newest first, as GET /v1/scans describes them."""
         return list(await self._ask("GET", "/v1/scans"))
+
+    async def scanner(self) -> dict[str, Any]:
+        """What the node's scanner is doing: phase, progress 0..1, sweeps finished, why the last one failed."""
+        return dict((await self._ask("GET", "/v1/node"))["capture"])
 
     async def start_sweep(self) -> dict[str, Any]:
         """Start a sweep. Returns at once with what POST /v1/sweeps says; the scan is announced by `published`."""

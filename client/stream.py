@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 
 import aiohttp
 from aiohttp import ClientWebSocketResponse, ClientWSTimeout, WSCloseCode, WSMsgType
@@ -105,11 +106,20 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
         raise NodeLost(f"{url!r} is no address of a node; use http://HOST:PORT") from error
     except aiohttp.WSServerHandshakeError as error:
         raise _refusal(url, error.status) from error
+    except aiohttp.ClientConnectorError as error:
+        why = _reason(error.os_error)
+        raise NodeLost(f"no node at {url}: {why}; check the address, or start one with `foveascan serve`") from error
     except (aiohttp.ClientError, OSError) as error:
-        raise NodeLost(f"no node at {url} ({error}); start one with `foveascan serve`") from error
+        raise NodeLost(f"{url} is no foveascan node: {error}") from error
     if socket.protocol != m.PROTOCOL:
         raise RemoteWireError(f"{url} does not speak {m.PROTOCOL}: update the older of the two")
     return socket
+
+
+def _reason(error: OSError) -> str:
+    """asyncio's own text names the call, not the reason; a failed look-up of a name has no errno of the system."""
+    known = error.errno is not None and error.errno > 0
+    return (os.strerror(error.errno) if known else error.strerror or str(error)).lower()
 
 
 def _refusal(url: str, status: int) -> NodeLost | RequestRefused:

@@ -93,7 +93,7 @@ class _Search:
 
 
 def _address(info: AsyncServiceInfo) -> NodeAddress | None:
-    """What a service record says, None when it gives no address. Its texts come from the network: unprintable is '?'."""
+    """What a service record says, None when it gives no address."""
     hosts = info.parsed_scoped_addresses(IPVersion.V4Only) or info.parsed_scoped_addresses(IPVersion.All)
     if not hosts or not info.port:
         return None
@@ -103,4 +103,5 @@ def _address(info: AsyncServiceInfo) -> NodeAddress | None:
 
 
 def _printable(raw: bytes) -> str:
+    """Text from anyone on the network, fit for a terminal."""
     return "".join(c if c.isprintable() else "?" for c in raw.decode(errors="replace"))

@@ -1,0 +1,77 @@
+"""The subcommand `scan`: have the node sweep once, and wait for the scan."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from client.session import Session
+
+POLL_S = 0.2
+
+
+def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Offer `scan`."""
+    scan = subparsers.add_parser("scan", help="start a sweep and wait until the scan is published")
+    scan.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
+    scan.add_argument("--token", help="what the node was paired with")
+    scan.add_argument("--timeout", type=float, default=3.0, metavar="S", help="seconds to search for nodes (3)")
+    scan.add_argument("--json", action="store_true", help="print one JSON object")
+    scan.set_defaults(run=run_scan)
+
+
+def run_scan(args: argparse.Namespace) -> int:
+    """Sweep once; print the new scan's id."""
+    import asyncio
+
+    scan = asyncio.run(_scan(args))
+    print(json.dumps({"scan": scan}) if args.json else f"scan {scan}", flush=True)
+    return 0
+
+
+async def _scan(args: argparse.Namespace) -> str:
+    from client.command import only_node
+    from client.session import connect
+
+    async with connect(args.node or await only_node(args.timeout), token=args.token) as session:
+        return await _sweep(session, silent=args.json)
+
+
+async def _sweep(session: Session, *, silent: bool) -> str:
+    """Start a sweep when the scanner is ready, follow it, return the scan's id. Raises ScannerFault when it fails."""
+    import asyncio
+
+    from tqdm import tqdm
+
+    from protocol.errors import ScannerFault
+
+    published = session.published()
+    before = await _ready(session)
+    await session.start_sweep()
+    with tqdm(total=100, unit="%", desc="sweeping", leave=False, disable=True if silent else None) as bar:
+        while True:
+            await asyncio.sleep(POLL_S)
+            status = await session.scanner()
+            bar.update(round(100 * status["progress"]) - bar.n)
+            if status["sweeps"] > before["sweeps"]:
+                return await anext(published)
+            if status["phase"] != "sweeping" and status["why"]:
+                raise ScannerFault(status["why"])
+
+
+async def _ready(session: Session) -> dict[str, Any]:
+    """The scanner's status once it is connected. Raises ScannerFault when there is none, or it does not come."""
+    import asyncio
+
+    from protocol.errors import ScannerFault
+
+    for _ in range(round(10 / POLL_S)):
+        status = await session.scanner()
+        if status["phase"] == "no scanner":
+            raise ScannerFault("this node has no scanner: start it with --scanner PATH")
+        if status["phase"] == "ready":
+            return status
+        await asyncio.sleep(POLL_S)
+    raise ScannerFault(status["why"] or "the scanner does not answer: is it connected and on?")

@@ -1,0 +1,66 @@
+"""Holding a model against the truth it was made from: how a demonstration or a test knows that detail has arrived."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from client.model import Model
+from protocol.grid import ImageArray, StepArray
+from protocol.region import region_round
+
+SEED = 7
+WINDOW = 0.05
+RANGE_MM = 0.1
+TEXTURE_DB = 40.0
+PERCENTILE = 99
+PSNR_MAX_DB = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What a simulated scanner swept: range_steps (H, W) uint16, 0 = void; texture (Ht, Wt, 3) uint8; step_mm."""
+
+    range_steps: StepArray
+    texture: ImageArray
+    step_mm: float
+
+    @classmethod
+    def read(cls, path: str | Path) -> Truth:
+        """The file that `foveascan simulate --truth` writes. Raises OSError."""
+        with np.load(path, allow_pickle=False) as file:
+            return cls(file["depth_u16"], file["texture"], float(file["scale_mm"]))
+
+    def clicks(self, count: int) -> list[tuple[float, float]]:
+        """Places (u, v) on measured cells, spread evenly at random, the same every time."""
+        cells = np.argwhere(self.range_steps > 0)
+        chosen = cells[np.random.default_rng(SEED).integers(len(cells), size=count)]
+        height, width = self.range_steps.shape
+        return [((column + 0.5) / width, (row + 0.5) / height) for row, column in chosen.tolist()]
+
+    def compare(self, model: Model, u: float, v: float, window: float = WINDOW) -> dict[str, float | bool]:
+        """What is left between model and truth in the window round (u, v).
+
+        range_error_mm_p99 : 99th percentile ("higher") over cells measured in both.   texture_psnr_db : over RGB.
+        ok : both within DESIGN 8's target, and voids where the truth has them and nowhere else.
+        """
+        height, width = self.range_steps.shape
+        region = region_round(u, v, window, width, height)
+        held, true = (steps[region.rows][:, region.columns] for steps in (model.range_steps, self.range_steps))
+        measured = (held > 0) & (true > 0)
+        error_mm = np.abs(held[measured].astype(np.int64) - true[measured]) * self.step_mm
+        error = float(np.percentile(error_mm, PERCENTILE, method="higher")) if error_mm.size else 0.0
+        psnr = self._psnr_db(model, u, v, window)
+        voids_agree = bool(np.array_equal(held == 0, true == 0))
+        reached = error <= RANGE_MM and psnr >= TEXTURE_DB
+        return {"range_error_mm_p99": error, "texture_psnr_db": psnr, "ok": reached and voids_agree}
+
+    def _psnr_db(self, model: Model, u: float, v: float, window: float) -> float:
+        height, width = self.texture.shape[:2]
+        region = region_round(u, v, window, width, height)
+        held, true = (image[region.rows][:, region.columns].astype(np.float64) for image in (model.texture, self.texture))
+        squared = float(np.mean((held - true) ** 2))
+        return PSNR_MAX_DB if squared == 0 else min(10 * math.log10(255**2 / squared), PSNR_MAX_DB)
