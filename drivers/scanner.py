@@ -134,7 +134,7 @@ class Scanner:
         self._link: ScannerLink | None = None
         self._info: DeviceInfo | None = None
         self._sweep = secrets.randbelow(65535)
-        self._silent_s = 0.0  # spent waiting since a frame was heard; the caller's own pauses do not count
+        self._silent_s = 0.0
         self._frames_heard = 0
 
     def hello(self) -> DeviceInfo:
@@ -146,7 +146,7 @@ class Scanner:
         self._link = link
         link.tick(self._clock())
         link.greet()
-        self._silent_s = 0.0
+        self._silent_s, self._frames_heard = 0.0, 0
         while self._info is None:
             self._info = self._await_greeting()
         return self._info
@@ -190,7 +190,7 @@ class Scanner:
                         yield event
                 elif event is not None:
                     yield from collector.take(event)
-                yield from collector.look_up(self._clock(), stop.is_set(), self._silent_s)
+                yield from collector.look_up(self._clock(), stop.is_set(), self._silence_s())
             self._flush()
         except PortLost as error:
             yield collector.interrupt(str(error), error)
@@ -239,7 +239,7 @@ class Scanner:
         if isinstance(event, Command):
             link.accept(event)
             return event.message
-        if link.commands_pending == 0 and self._silent_s > self._config.quiet_s:
+        if link.commands_pending == 0 and self._silence_s() > self._config.quiet_s:
             raise ScannerFault(f"{self._port.name}: silent for {self._config.quiet_s:g} s")
         return None
 
@@ -291,11 +291,16 @@ class Scanner:
         link, began_s = self._greeted, self._clock()
         data = self._port.read(_READ_BYTES, max(timeout_s, 0.0))
         now_s = self._clock()
-        self._silent_s = self._silent_s + now_s - began_s if link.frames_heard == self._frames_heard else 0.0
-        self._frames_heard = link.frames_heard
+        self._silent_s = self._silence_s() + now_s - began_s
         if data:
             link.receive_data(data, now_s)
         link.tick(now_s)
+
+    def _silence_s(self) -> float:
+        """Time spent waiting since the last good frame; the caller's own pauses do not count. [s]"""
+        if self._greeted.frames_heard != self._frames_heard:
+            self._frames_heard, self._silent_s = self._greeted.frames_heard, 0.0
+        return self._silent_s
 
     def _flush(self) -> None:
         data = self._greeted.data_to_send()

@@ -109,6 +109,7 @@ class PtyPort:
         self._link_path = link_path
         self._rate_bytes_s = baud / _BITS_PER_BYTE
         self._free_s = 0.0
+        _check_free(link_path)
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -169,10 +170,14 @@ def serve(scanner: SimulatedScanner, port: PtyPort, stop: threading.Event) -> No
             port.write(data)
 
 
-def _replace_link(path: Path, target: str) -> None:
-    """Make `path` a symbolic link to `target`, in one step; FileExistsError where something else stands there."""
+def _check_free(path: Path) -> None:
+    """Raise FileExistsError where something stands that no scanner left behind."""
     if os.path.lexists(path) and not path.is_symlink():
         raise FileExistsError(f"{path} exists and is no symbolic link")
+
+
+def _replace_link(path: Path, target: str) -> None:
+    """Make `path` a symbolic link to `target`, in one step."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     os.symlink(target, fresh)
     os.replace(fresh, path)

@@ -37,9 +37,15 @@ def test_every_piece_counts_once():
 def test_what_lies_outside_the_announced_sweep_is_a_stray():
     ledger = Ledger(header(Channel.RANGE))
     for stray in (
-        piece(W), piece(0, row0=12, rows=1), piece(0, row0=1), piece(0, row0=8, rows=3), piece(0, rows=3), piece(0, sweep=2),
-        piece(0, pass_index=1), piece(0, channel=Channel.TEXTURE),
-    ):  # fmt: skip
+        piece(W),
+        piece(0, row0=12, rows=1),
+        piece(0, row0=1),
+        piece(0, row0=8, rows=3),
+        piece(0, rows=3),
+        piece(0, sweep=2),
+        piece(0, pass_index=1),
+        piece(0, channel=Channel.TEXTURE),
+    ):
         assert not ledger.take(stray)
     assert (ledger.held, ledger.strays) == (0, 8)
 
