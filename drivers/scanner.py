@@ -14,7 +14,7 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 
 from drivers.ledger import Ledger
@@ -159,7 +159,7 @@ class Scanner:
             if isinstance(report, Calibration):
                 return report
 
-    def sweep(self, request: SweepRequest, stop: threading.Event | None = None) -> Iterator[SweepEvent]:
+    def sweep(self, request: SweepRequest, stop: threading.Event | None = None) -> Generator[SweepEvent, None, None]:
         """One sweep, event by event; whatever the scanner was doing is dropped first. Setting `stop` ends it.
 
         Raises PortLost or ScannerFault when it does not even start.

@@ -4,37 +4,45 @@ from hypothesis import strategies as st
 
 from drivers.ledger import Ledger
 from protocol.grid import GridSpec
-from protocol.scanner_messages import RUNS_MAX, Channel, ColumnRun, RangeColumn, SweepHeader, TextureColumn
+from protocol.scanner_messages import RUNS_MAX, Channel, Column, ColumnRun, RangeColumn, SweepHeader, TextureColumn
 
 W, H, WT, HT, ROWS = 16, 10, 32, 9, 4
 
 
-def header(channels=Channel.BOTH, passes=1, width=W):
+def header(channels: Channel = Channel.BOTH, passes: int = 1, width: int = W) -> SweepHeader:
     return SweepHeader(3, GridSpec(width, H, WT, HT, 1, 1), 1000, ROWS, ROWS, channels, passes)
 
 
-def piece(column, row0=0, rows=None, channel=Channel.RANGE, sweep=3, pass_index=0):
-    cls, height = (RangeColumn, H) if channel is Channel.RANGE else (TextureColumn, HT)
+def piece(
+    column: int,
+    row0: int = 0,
+    rows: int | None = None,
+    channel: Channel = Channel.RANGE,
+    sweep: int = 3,
+    pass_index: int = 0,
+) -> Column:
+    cls: type[Column] = RangeColumn if channel is Channel.RANGE else TextureColumn
+    height = H if channel is Channel.RANGE else HT
     rows = min(ROWS, height - row0) if rows is None else rows
     return cls(sweep, pass_index, column, row0, column, 0, bytes(rows * cls.SAMPLE_BYTES))
 
 
-def column(index, **kind):
-    return [piece(index, row0, **kind) for row0 in range(0, H if "channel" not in kind else HT, ROWS)]
+def column(index: int, channel: Channel = Channel.RANGE) -> list[Column]:
+    return [piece(index, row0, channel=channel) for row0 in range(0, H if channel is Channel.RANGE else HT, ROWS)]
 
 
-def columns_of(runs):
+def columns_of(runs: tuple[ColumnRun, ...]) -> set[tuple[Channel, int, int]]:
     return {(run.channel, run.pass_index, run.first + i) for run in runs for i in range(run.count)}
 
 
-def test_every_piece_counts_once():
+def test_every_piece_counts_once() -> None:
     ledger = Ledger(header())
     assert ledger.expected == W * 3 + WT * 3
     assert ledger.take(piece(0)) and not ledger.take(piece(0))
     assert (ledger.held, ledger.duplicates, ledger.strays) == (1, 1, 0)
 
 
-def test_what_lies_outside_the_announced_sweep_is_a_stray():
+def test_what_lies_outside_the_announced_sweep_is_a_stray() -> None:
     ledger = Ledger(header(Channel.RANGE))
     for stray in (
         piece(W),
@@ -51,7 +59,7 @@ def test_what_lies_outside_the_announced_sweep_is_a_stray():
 
 
 @given(st.sets(st.integers(0, W - 1)), st.sets(st.integers(0, WT - 1)))
-def test_missing_names_exactly_the_incomplete_columns(range_lost, texture_lost):
+def test_missing_names_exactly_the_incomplete_columns(range_lost: set[int], texture_lost: set[int]) -> None:
     ledger = Ledger(header())
     for index in range(W):
         for part in column(index)[: 2 if index in range_lost else 3]:
@@ -63,7 +71,7 @@ def test_missing_names_exactly_the_incomplete_columns(range_lost, texture_lost):
     assert columns_of(ledger.missing()) == wanted
 
 
-def test_one_request_carries_no_more_runs_than_fit():
+def test_one_request_carries_no_more_runs_than_fit() -> None:
     ledger = Ledger(header(Channel.RANGE, width=800))
     for index in range(0, 800, 2):
         for part in column(index):
@@ -71,7 +79,7 @@ def test_one_request_carries_no_more_runs_than_fit():
     assert len(ledger.missing()) == RUNS_MAX
 
 
-def test_columns_left_behind_are_named_once():
+def test_columns_left_behind_are_named_once() -> None:
     ledger = Ledger(header(Channel.RANGE))
     for index in (0, 1, 5, 6, 7, 8):
         for part in column(index):
@@ -81,7 +89,7 @@ def test_columns_left_behind_are_named_once():
     assert columns_of(ledger.missing()) > columns_of((ColumnRun(Channel.RANGE, 0, 2, 3),))
 
 
-def test_columns_given_up_are_no_longer_asked_for_but_remain_lost():
+def test_columns_given_up_are_no_longer_asked_for_but_remain_lost() -> None:
     ledger = Ledger(header(Channel.RANGE))
     ledger.give_up((ColumnRun(Channel.RANGE, 0, 4, 2), ColumnRun(Channel.TEXTURE, 9, 0, 5)))
     assert ledger.lost_columns() == 2
@@ -92,7 +100,7 @@ def test_columns_given_up_are_no_longer_asked_for_but_remain_lost():
 
 
 @given(st.permutations(range(W)), st.integers(1, 3))
-def test_the_digest_knows_no_order(order, times):
+def test_the_digest_knows_no_order(order: list[int], times: int) -> None:
     ahead, mixed = Ledger(header()), Ledger(header())
     for index in range(W):
         ahead.take(piece(index))

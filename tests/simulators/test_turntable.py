@@ -6,31 +6,31 @@ from hypothesis import strategies as st
 from protocol.grid import Grid, GridSpec
 from protocol.scanner_messages import Channel
 from simulators.specimen import Specimen
-from simulators.turntable import Turntable
+from simulators.turntable import Exposure, Turntable
 
 W, H, WT, HT = 24, 5, 30, 4
 ROOMY = 10**6
 
 
-def specimen(width=W, texture_width=WT):
+def specimen(width: int = W, texture_width: int = WT) -> Specimen:
     rng = np.random.default_rng(5)
     steps = rng.integers(0, 60000, (H, width)).astype(np.uint16)
     texture = rng.integers(0, 256, (HT, texture_width, 3)).astype(np.uint8)
     return Specimen("noise", Grid(GridSpec(width, H, texture_width, HT, 0.01, 1.0, theta0_rad=1.1), steps, texture))
 
 
-def sweep(table, channels=Channel.BOTH, passes=1, dt_s=0.01, room=ROOMY):
-    table.begin(channels, passes)
+def sweep(table: Turntable, *, passes: int = 1, dt_s: float = 0.01) -> list[Exposure]:
+    table.begin(Channel.BOTH, passes)
     seen = []
     while table.is_moving:
-        seen += table.step(dt_s, room)
+        seen += table.step(dt_s, ROOMY)
     return seen
 
 
 @pytest.mark.parametrize(
     ("width", "texture_width"), [(W, WT), (360, 1024), (1440, 4096), (4096, 8192), (7, 13), (1, 1)]
 )
-def test_a_steady_table_shows_the_truth_at_every_column(width, texture_width):
+def test_a_steady_table_shows_the_truth_at_every_column(width: int, texture_width: int) -> None:
     table = Turntable(specimen(width, texture_width))
     seen = sweep(table)
     truth = table.specimen.grid
@@ -40,7 +40,7 @@ def test_a_steady_table_shows_the_truth_at_every_column(width, texture_width):
         np.testing.assert_array_equal(table.samples(exposure), array[:, exposure.column])
 
 
-def test_columns_come_in_the_order_of_their_angle():
+def test_columns_come_in_the_order_of_their_angle() -> None:
     seen = sweep(Turntable(specimen()), passes=2)
     encoders = [exposure.encoder for exposure in seen]
     assert encoders == sorted(encoders)
@@ -49,9 +49,9 @@ def test_columns_come_in_the_order_of_their_angle():
 
 
 @given(st.lists(st.floats(1e-4, 0.4), min_size=1, max_size=20), st.integers(1, 20))
-def test_the_same_turn_whatever_the_steps(steps_s, room):
+def test_the_same_turn_whatever_the_steps(steps_s: list[float], room: int) -> None:
     whole = sweep(Turntable(specimen(), jitter_counts=300.0, seed=9), dt_s=9.0)
-    table, seen = Turntable(specimen(), jitter_counts=300.0, seed=9), []
+    table, seen = Turntable(specimen(), jitter_counts=300.0, seed=9), list[Exposure]()
     table.begin(Channel.BOTH, 1)
     while table.is_moving:
         for dt_s in steps_s:
@@ -61,7 +61,7 @@ def test_the_same_turn_whatever_the_steps(steps_s, room):
     assert [(e.channel, e.column, e.encoder) for e in seen] == [(e.channel, e.column, e.encoder) for e in whole]
 
 
-def test_a_table_without_room_stands_still_while_time_goes_on():
+def test_a_table_without_room_stands_still_while_time_goes_on() -> None:
     table = Turntable(specimen())
     table.begin(Channel.BOTH, 1)
     (first,) = table.step(0.5, 1)
@@ -71,7 +71,7 @@ def test_a_table_without_room_stands_still_while_time_goes_on():
     assert second.time_us - first.time_us > 5_000_000
 
 
-def test_a_turn_takes_its_time():
+def test_a_turn_takes_its_time() -> None:
     table = Turntable(specimen(), turn_s=4.0)
     seen = sweep(table)
     times_us = [exposure.time_us for exposure in seen]
@@ -79,7 +79,7 @@ def test_a_turn_takes_its_time():
     assert seen[-1].time_us - seen[0].time_us == pytest.approx(4e6, rel=0.1)
 
 
-def test_jitter_moves_triggers_and_the_encoder_says_so():
+def test_jitter_moves_triggers_and_the_encoder_says_so() -> None:
     table = Turntable(specimen(), jitter_counts=200.0, seed=1)
     seen = [e for e in sweep(table) if e.channel is Channel.RANGE]
     nominal = (np.array([e.column for e in seen]) + 0.5) * table.counts_per_turn / W
@@ -90,17 +90,17 @@ def test_jitter_moves_triggers_and_the_encoder_says_so():
         np.testing.assert_array_equal(table.samples(exposure), table.specimen.range_column(angle_rad))
 
 
-def test_the_seed_decides_the_jitter():
+def test_the_seed_decides_the_jitter() -> None:
     encoders = [[e.encoder for e in sweep(Turntable(specimen(), jitter_counts=50.0, seed=seed))] for seed in (1, 1, 2)]
     assert encoders[0] == encoders[1] != encoders[2]
 
 
-def test_wild_jitter_never_makes_columns_change_places():
+def test_wild_jitter_never_makes_columns_change_places() -> None:
     seen = sweep(Turntable(specimen(), jitter_counts=1e6))
     assert [e.column for e in seen if e.channel is Channel.TEXTURE] == list(range(WT))
 
 
-def test_after_a_halt_the_next_sweep_begins_at_the_home_mark():
+def test_after_a_halt_the_next_sweep_begins_at_the_home_mark() -> None:
     table = Turntable(specimen(), home_encoder=700)
     table.begin(Channel.BOTH, 1)
     table.step(0.3, ROOMY)
@@ -114,7 +114,7 @@ def test_after_a_halt_the_next_sweep_begins_at_the_home_mark():
             np.testing.assert_array_equal(table.samples(exposure), table.specimen.grid.range_steps[:, exposure.column])
 
 
-def test_homing_goes_to_the_home_mark():
+def test_homing_goes_to_the_home_mark() -> None:
     table = Turntable(specimen(), home_encoder=700)
     table.begin(Channel.RANGE, 1)
     table.step(0.3, ROOMY)
@@ -124,6 +124,6 @@ def test_homing_goes_to_the_home_mark():
     assert table.encoder == 700 and not table.is_moving
 
 
-def test_more_turns_than_the_encoder_counts_are_refused():
+def test_more_turns_than_the_encoder_counts_are_refused() -> None:
     with pytest.raises(ValueError, match="overrun the encoder"):
         Turntable(specimen(16384, 16383)).begin(Channel.BOTH, 64)
