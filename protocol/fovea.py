@@ -79,7 +79,7 @@ def view_to_cartesian(view: FloatArray, fovea: float, alpha: float, s: float) ->
 
 def cyclic_offset(x: FloatArray, fovea: float, width: int) -> FloatArray:
     """Signed offset from the fovea round a cycle of `width`, in [-width/2, width/2)."""
-    return (np.asarray(x, np.float64) - fovea + width / 2) % width - width / 2
+    return _wrapped(np.asarray(x, np.float64) - fovea + width / 2, width) - width / 2
 
 
 def cylinder_to_view(x: FloatArray, fovea: float, width: int, alpha: float, sigma: float) -> FloatArray:
@@ -89,7 +89,7 @@ def cylinder_to_view(x: FloatArray, fovea: float, width: int, alpha: float, sigm
     """
     offset = cyclic_offset(x, fovea, width)
     s = scale_from_sigma(sigma, width / 2, alpha)
-    return (fovea + np.copysign(radius_to_view(np.abs(offset), alpha, s), offset)) % width
+    return _wrapped(fovea + np.copysign(radius_to_view(np.abs(offset), alpha, s), offset), width)
 
 
 def scale_from_sigma(sigma: float, radius_max: float, alpha: float) -> float:
@@ -161,6 +161,12 @@ def open_positions(table: FoveaTable, fovea: float, height: int) -> FloatArray:
     """Sample positions of the y axis, ascending; rows outside the grid are dropped. (n,) float64."""
     positions = np.concatenate([fovea - table.offset[1:][::-1], fovea + table.offset])
     return positions[(positions >= 0) & (positions <= height - 1)]
+
+
+def _wrapped(position: FloatArray, width: int) -> FloatArray:
+    """Positions modulo width, in [0, width): the remainder of a tiny negative number rounds to width itself."""
+    remainder = position % width
+    return np.where(remainder == width, 0.0, remainder)
 
 
 def _check_transform(alpha: float, s: float) -> None:

@@ -40,7 +40,8 @@ def range_samples(scan: StepArray, selection: Selection) -> StepArray:
     lattice = selection.lattice
     rows = lattice.y.border[selection.y.sample] // 2
     columns = lattice.x.border[selection.x.sample] // 2 % scan.shape[1]
-    return scan[np.ix_(rows, columns)]
+    samples: StepArray = scan[np.ix_(rows, columns)]
+    return samples
 
 
 def refine(
@@ -116,10 +117,10 @@ def test_level_nought_holds_the_scan(case: tuple[ChannelShape, int, list[tuple[P
     level, rank = (
         np.repeat(np.repeat(a, side, 0), side, 1)[: shape.height, : shape.width] for a in (held.level, held.rank)
     )
-    quantum = 65535 - rank.astype(np.int64)
+    held_quantum = 65535 - rank.astype(np.int64)
     full = (level == 0) & (rank > 0)
-    assert np.all(np.abs(dense.astype(np.int64) - scan)[full] <= quantum[full] // 2)
-    exact = full & (quantum == 1)
+    assert np.all(np.abs(dense.astype(np.int64) - scan)[full] <= held_quantum[full] // 2)
+    exact = full & (held_quantum == 1)
     assert np.array_equal(dense[exact], scan[exact])
 
 
@@ -343,7 +344,10 @@ def coarse_cell(coarse: StepArray, row: int, column: int, height: int, width: in
     )
     y0, x0 = y.numerator // y.denominator, x.numerator // x.denominator
     nearest = y0 + (y - y0 >= Fraction(1, 2)), x0 + (x - x0 >= Fraction(1, 2))
-    value = lambda i, j: int(coarse[min(max(i, 0), h - 1), j % w])  # noqa: E731
+
+    def value(i: int, j: int) -> int:
+        return int(coarse[min(max(i, 0), h - 1), j % w])
+
     if value(*nearest) == 0:
         return 0
     total = weight = Fraction(0)
