@@ -29,6 +29,7 @@ from protocol.errors import LocalWireError, RemoteWireError
 from protocol.holdings import LevelArray, RankArray
 from protocol.lattice import Channel
 from protocol.refinement import Generator, Refinement
+from protocol.session import Said
 
 REPLY_MAX_BYTES = 4 << 20
 HTTP_TIMEOUT = aiohttp.ClientTimeout(total=30)
@@ -232,7 +233,7 @@ class Session:
         except Exception as error:  # whatever it was, whoever waits must hear of it
             self._end(error)
 
-    async def _take(self, said: m.Message | Refinement, size: int) -> None:
+    async def _take(self, said: Said, size: int) -> None:
         match said:
             case Refinement():
                 await self._refine(said, size)

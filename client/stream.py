@@ -11,8 +11,8 @@ from aiohttp import ClientWebSocketResponse, ClientWSTimeout, WSCloseCode, WSMsg
 from client.errors import NodeLost, RequestRefused
 from protocol import messages as m
 from protocol.errors import RemoteWireError
-from protocol.refinement import CRC, HEADER, MASK_MAX, PARAMETERS_MAX, PAYLOAD_MAX, Refinement
-from protocol.session import Role
+from protocol.refinement import CRC, HEADER, MASK_MAX, PARAMETERS_MAX, PAYLOAD_MAX
+from protocol.session import Role, Said
 from protocol.session import Session as Order
 
 PATH = "/v1/stream"
@@ -47,7 +47,7 @@ class Stream:
                 raise NodeLost(f"{self.url} ended the stream: {reason}")
         return info
 
-    async def receive(self) -> tuple[m.Message | Refinement, int]:
+    async def receive(self) -> tuple[Said, int]:
         """The next thing the node says, and its size in bytes. Raises NodeLost or RemoteWireError."""
         message = await self._socket.receive()
         if message.type not in (WSMsgType.TEXT, WSMsgType.BINARY):
@@ -118,8 +118,9 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
 
 def _reason(error: OSError) -> str:
     """asyncio's own text names the call, not the reason; a failed look-up of a name has no errno of the system."""
-    known = error.errno is not None and error.errno > 0
-    return (os.strerror(error.errno) if known else error.strerror or str(error)).lower()
+    if error.errno is not None and error.errno > 0:
+        return os.strerror(error.errno).lower()
+    return (error.strerror or str(error)).lower()
 
 
 def _refusal(url: str, status: int) -> NodeLost | RequestRefused:

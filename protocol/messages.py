@@ -162,6 +162,33 @@ class Published(_Message, frozen=True):
     scan: ShortText
 
 
+class LiveStarted(_Message, frozen=True):
+    """A sweep runs, and this client watches it: columns of its coarse grids follow as they come in.
+
+    sweep : counts the node's sweeps.  grid : the scan to be, without an id; the live view has its coarse shapes.
+    """
+
+    sweep: Count
+    grid: ScanInfo
+
+
+class LiveProgress(_Message, frozen=True):
+    """How much of the sweep is in, and how long the rest will take; null while nobody can tell."""
+
+    sweep: Count
+    percent: Annotated[float, Meta(ge=0, le=100)]
+    seconds_left: Annotated[float, Meta(ge=0)] | None = None
+
+
+class LiveEnded(_Message, frozen=True):
+    """The sweep is over: published as a scan, or interrupted, and why."""
+
+    sweep: Count
+    reason: Literal["published", "interrupted"]
+    scan: ShortText = ""
+    why: ShortText = ""
+
+
 class Refused(_Message, frozen=True):
     """A request failed; the stream goes on. request 0: none in particular."""
 
@@ -245,8 +272,17 @@ class Cancel(_Message, frozen=True):
     request: Count
 
 
-FromNode = ServerInfo | Welcome | Opened | Updated | Resync | Published | Refused | Goodbye
-FromClient = Hello | Open | Look | Ack | State | Cancel
+class Watch(_Message, frozen=True):
+    """Show me sweeps while they run (the one that runs now from its beginning), or show them no more."""
+
+    live: bool
+
+
+FromNode = (
+    ServerInfo | Welcome | Opened | Updated | Resync | Published | Refused | Goodbye
+    | LiveStarted | LiveProgress | LiveEnded
+)  # fmt: skip
+FromClient = Hello | Open | Look | Ack | State | Cancel | Watch
 Message = FromNode | FromClient
 
 _encoder = msgspec.json.Encoder()

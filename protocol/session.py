@@ -1,15 +1,16 @@
 """The order of a stream, for both ends. All transitions live here; nothing here does I/O or knows what a scan is.
 
-A Session turns what arrives into messages and refinements, and what is to be sent into text or bytes. It refuses what
-the other end may not say now (RemoteWireError) and what we may not (LocalWireError). Joined to each other, the two
-roles test each other.
+A Session turns what arrives into messages, refinements and live columns, and what is to be sent into text or bytes. It
+refuses what the other end may not say now (RemoteWireError) and what we may not (LocalWireError). Joined to each other,
+the two roles test each other.
 
     phase     node says                                        client says
     new       serverInfo -> greeted                            -
     greeted   refused, goodbye -> closed                       hello -> waiting
     waiting   welcome -> ready, refused, goodbye -> closed     -
-    ready     opened, updated, resync, published, refused,     open, look, ack, state, cancel
-              refinements, goodbye -> closed
+    ready     opened, updated, resync, published, refused,     open, look, ack, state, cancel, watch
+              refinements, goodbye -> closed,
+              liveStarted, liveProgress, liveEnded, live columns
     closed    -                                                -
 """
 
@@ -19,6 +20,7 @@ from enum import Enum
 
 from protocol import messages as m
 from protocol.errors import LocalWireError, RemoteWireError, WireError
+from protocol.live import LiveColumns, is_live
 from protocol.refinement import Refinement
 
 
@@ -39,8 +41,11 @@ class Phase(Enum):
     CLOSED = "closed"
 
 
-_SERVING = (m.Opened, m.Updated, m.Resync, m.Published, m.Refused, m.Goodbye, Refinement)
-_ASKING = (m.Open, m.Look, m.Ack, m.State, m.Cancel)
+Said = m.Message | Refinement | LiveColumns
+
+_LIVE = (m.LiveStarted, m.LiveProgress, m.LiveEnded, LiveColumns)
+_SERVING = (m.Opened, m.Updated, m.Resync, m.Published, m.Refused, m.Goodbye, Refinement, *_LIVE)
+_ASKING = (m.Open, m.Look, m.Ack, m.State, m.Cancel, m.Watch)
 _MAY_SAY: dict[tuple[Role, Phase], tuple[type, ...]] = {
     (Role.NODE, Phase.NEW): (m.ServerInfo,),
     (Role.NODE, Phase.GREETED): (m.Refused, m.Goodbye),
@@ -64,19 +69,23 @@ class Session:
         self.role = role
         self.phase = Phase.NEW
 
-    def receive(self, data: str | bytes) -> m.Message | Refinement:
-        """What the other end said: text is a message, bytes a refinement. Raises RemoteWireError."""
-        said = m.decode_message(data) if isinstance(data, str) else Refinement.from_bytes(data)
+    def receive(self, data: str | bytes) -> Said:
+        """What the other end said: text is a message, bytes are refinements or live columns. Raises RemoteWireError."""
+        said = m.decode_message(data) if isinstance(data, str) else _from_bytes(data)
         other = Role.CLIENT if self.role is Role.NODE else Role.NODE
         self._advance(other, said, RemoteWireError)
         return said
 
-    def send(self, said: m.Message | Refinement) -> str | bytes:
+    def send(self, said: Said) -> str | bytes:
         """What to put on the wire. Raises LocalWireError."""
         self._advance(self.role, said, LocalWireError)
-        return said.to_bytes() if isinstance(said, Refinement) else m.encode_message(said)
+        return said.to_bytes() if isinstance(said, Refinement | LiveColumns) else m.encode_message(said)
 
-    def _advance(self, speaker: Role, said: m.Message | Refinement, error: type[WireError]) -> None:
+    def _advance(self, speaker: Role, said: Said, error: type[WireError]) -> None:
         if not isinstance(said, _MAY_SAY.get((speaker, self.phase), ())):
             raise error(f"a {speaker.value} may not say {type(said).__name__} in a {self.phase.value} stream")
         self.phase = _LEADS_TO.get(type(said), self.phase)
+
+
+def _from_bytes(data: bytes) -> Refinement | LiveColumns:
+    return LiveColumns.from_bytes(data) if is_live(data) else Refinement.from_bytes(data)

@@ -20,6 +20,9 @@ EVERY: list[m.Message] = [
     m.Updated(1, 5, "complete"),
     m.Resync(2, "digest"),
     m.Published("ab12"),
+    m.LiveStarted(1, msgspec.structs.replace(SCAN, id="")),
+    m.LiveProgress(1, 41.5, 2.5),
+    m.LiveEnded(1, "interrupted", why="the port is gone"),
     m.Refused(1, "busy", "later"),
     m.Goodbye("shutting down"),
     m.Hello("foveascan.v1"),
@@ -28,6 +31,7 @@ EVERY: list[m.Message] = [
     m.Ack(2, 5, "0123456789abcdef"),
     m.State(2, 5, STATEMENT),
     m.Cancel(1),
+    m.Watch(True),
 ]
 
 
@@ -99,6 +103,9 @@ OUT_OF_BOUNDS: list[dict[str, Any]] = [
     {"type": "hello", "protocol": "p", "codecs": []},
     {"type": "hello", "protocol": "p", "codecs": ["jpeg"] * 9},
     {"type": "open", "request": 1, "scan": "s" * 201},
+    {"type": "liveProgress", "sweep": 1, "percent": 101},
+    {"type": "liveProgress", "sweep": 1, "percent": 1, "secondsLeft": -1},
+    {"type": "liveEnded", "sweep": 1, "reason": "bored"},
     {"type": "shout"},
     {"request": 1},
     {},

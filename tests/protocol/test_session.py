@@ -5,21 +5,24 @@ from hypothesis import strategies as st
 from protocol import messages as m
 from protocol.errors import LocalWireError, RemoteWireError, WireError
 from protocol.lattice import Channel, Parameters
+from protocol.live import LiveColumns
 from protocol.refinement import Generator, Refinement
-from protocol.session import Phase, Role, Session
+from protocol.session import Phase, Role, Said, Session
 from tests.protocol.test_messages import EVERY
 
 REFINEMENT = Refinement(Generator.FOVEA, Channel.RANGE, 1, 0, 0, 0, 1, 9, b"z", b"", Parameters(2, 0, 0, 1, 1))
-SAYINGS: dict[str, m.Message | Refinement] = {type(said).__name__: said for said in (*EVERY, REFINEMENT)}
+LIVE_COLUMNS = LiveColumns(Channel.RANGE, 1, (3,), 2, b"abcd")
+SAYINGS: dict[str, Said] = {type(said).__name__: said for said in (*EVERY, REFINEMENT, LIVE_COLUMNS)}
 
 # The table of PROTOCOL.md, "Stream", once more.
 ALLOWED = {
     (Role.NODE, Phase.NEW): {"ServerInfo"},
     (Role.NODE, Phase.GREETED): {"Refused", "Goodbye"},
     (Role.NODE, Phase.WAITING): {"Welcome", "Refused", "Goodbye"},
-    (Role.NODE, Phase.READY): {"Opened", "Updated", "Resync", "Published", "Refused", "Goodbye", "Refinement"},
+    (Role.NODE, Phase.READY): {"Opened", "Updated", "Resync", "Published", "Refused", "Goodbye", "Refinement"}
+    | {"LiveStarted", "LiveProgress", "LiveEnded", "LiveColumns"},
     (Role.CLIENT, Phase.GREETED): {"Hello"},
-    (Role.CLIENT, Phase.READY): {"Open", "Look", "Ack", "State", "Cancel"},
+    (Role.CLIENT, Phase.READY): {"Open", "Look", "Ack", "State", "Cancel", "Watch"},
 }
 OPENING = [(Role.NODE, "ServerInfo"), (Role.CLIENT, "Hello"), (Role.NODE, "Welcome"), (Role.NODE, "Goodbye")]
 PHASES = [Phase.NEW, Phase.GREETED, Phase.WAITING, Phase.READY, Phase.CLOSED]
@@ -33,7 +36,7 @@ def joined(steps: int) -> dict[Role, Session]:
     return ends
 
 
-def say(ends: dict[Role, Session], speaker: Role, said: m.Message | Refinement) -> None:
+def say(ends: dict[Role, Session], speaker: Role, said: Said) -> None:
     wire = ends[speaker].send(said)
     assert ends[other(speaker)].receive(wire) == said
 
@@ -55,7 +58,7 @@ def test_each_may_say_what_the_table_says(steps: int, speaker: Role, name: str) 
     with pytest.raises(LocalWireError):
         ends[speaker].send(SAYINGS[name])
     said = SAYINGS[name]
-    wire = said.to_bytes() if isinstance(said, Refinement) else m.encode_message(said)
+    wire = said.to_bytes() if isinstance(said, Refinement | LiveColumns) else m.encode_message(said)
     with pytest.raises(RemoteWireError):
         ends[other(speaker)].receive(wire)
     assert all(end.phase is PHASES[steps] for end in ends.values()), "a refusal moved the stream on"
@@ -81,9 +84,10 @@ def test_noise_is_refused_in_every_phase(role: Role, steps: int, noise: bytes | 
     assert end.phase is PHASES[steps]
 
 
-def test_text_is_for_messages_and_bytes_for_refinements() -> None:
+def test_text_is_for_messages_and_bytes_for_samples() -> None:
     ends = joined(3)
     assert isinstance(ends[Role.NODE].send(REFINEMENT), bytes)
+    assert isinstance(ends[Role.NODE].send(LIVE_COLUMNS), bytes)
     assert isinstance(ends[Role.NODE].send(m.Published("x")), str)
     with pytest.raises(RemoteWireError):
         ends[Role.CLIENT].receive(m.encode_message(m.Published("x")).encode())
