@@ -189,14 +189,19 @@ class Scanner:
                     if collector.take_column(event):
                         yield event
                 elif event is not None:
-                    yield from collector.take(event)
-                yield from collector.look_up(self._clock(), stop.is_set(), self._silence_s())
-            self._flush()
+                    yield from self._answering(collector.take(event))
+                yield from self._answering(collector.look_up(self._clock(), stop.is_set(), self._silence_s()))
         except PortLost as error:
             yield collector.interrupt(str(error), error)
         finally:
             if not collector.is_over:  # the caller walked away
                 self._wave_off(header.sweep)
+
+    def _answering(self, outcomes: Iterator[SweepEvent]) -> Iterator[SweepEvent]:
+        """The same events, each told to the caller after the scanner got its answer: the caller may not come back."""
+        for outcome in outcomes:
+            self._flush()
+            yield outcome
 
     def _wave_off(self, sweep: int) -> None:
         """Tell the scanner to stop, without waiting to be heard."""

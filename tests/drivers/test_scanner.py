@@ -24,6 +24,7 @@ from protocol.grid import Grid, GridSpec
 from protocol.scanner_messages import (
     COLUMN_OVERHEAD,
     Channel,
+    Fault,
     RangeColumn,
     Reset,
     State,
@@ -241,6 +242,22 @@ def test_a_pulled_plug_interrupts_the_sweep_and_says_so() -> None:
     assert isinstance(last, SweepInterrupted) and isinstance(last.cause, PortLost)
     with pytest.raises(PortLost):
         bench.scanner.hello()
+
+
+def test_an_error_of_the_scanner_interrupts_the_sweep_with_its_words() -> None:
+    bench = greeted()
+    last = bench.sweep(at_event=lambda count, _: bench.device._link.send(Fault(3, "jam")) if count == 20 else None)
+    assert isinstance(last, SweepInterrupted) and last.reason == "scanner error 3: jam"
+    assert isinstance(last.cause, ScannerFault)
+
+
+def test_a_caller_that_leaves_at_the_last_event_has_answered_the_scanner() -> None:
+    bench = greeted()
+    for event in bench.scanner.sweep(SweepRequest()):
+        if isinstance(event, SweepFinished):
+            break
+    bench.device.step(bench.port.clock())
+    assert bench.device._link.commands_pending == 0
 
 
 def test_stop_ends_the_sweep_and_the_scanner_is_free_again() -> None:
