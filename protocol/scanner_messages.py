@@ -73,8 +73,25 @@ class NakCode(IntEnum):
     FAULT = 7
 
 
+class _Plain:
+    """A message whose fields lie on the line one after the other, each with its place in the layout."""
+
+    __slots__ = ()
+    _LAYOUT: ClassVar[struct.Struct]
+    __match_args__: ClassVar[tuple[str, ...]]
+
+    def to_bytes(self) -> bytes:
+        """As the message's table."""
+        return self._LAYOUT.pack(*(getattr(self, name) for name in self.__match_args__))
+
+    @classmethod
+    def from_bytes(cls, payload: Payload) -> Self:
+        """Inverse of to_bytes."""
+        return cls(*_unpack(cls._LAYOUT, payload))
+
+
 @dataclass(frozen=True, slots=True)
-class Hello:
+class Hello(_Plain):
     """Host to device: who asks, how long a payload it reads, and how many bytes of columns it takes unasked."""
 
     TYPE: ClassVar[int] = 0x01
@@ -83,15 +100,6 @@ class Hello:
     minor: int = MINOR
     payload_max: int = SERIAL_PAYLOAD_MAX
     window_bytes: int = 65536
-
-    def to_bytes(self) -> bytes:
-        """As the table HELLO."""
-        return self._LAYOUT.pack(self.major, self.minor, self.payload_max, self.window_bytes)
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls(*_unpack(cls._LAYOUT, payload))
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,21 +138,12 @@ class DeviceInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Ack:
+class Ack(_Plain):
     """The command numbered `acked_seq` is accepted."""
 
     TYPE: ClassVar[int] = 0x03
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<I")
     acked_seq: int
-
-    def to_bytes(self) -> bytes:
-        """As the table ACK."""
-        return self._LAYOUT.pack(self.acked_seq)
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls(*_unpack(cls._LAYOUT, payload))
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,37 +168,20 @@ class Nak:
 
 
 @dataclass(frozen=True, slots=True)
-class Reset:
+class Reset(_Plain):
     """Host to device: drop the sweep, its columns and the configuration, and be idle."""
 
     TYPE: ClassVar[int] = 0x05
-
-    def to_bytes(self) -> bytes:
-        """Empty."""
-        return b""
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls()
+    _LAYOUT: ClassVar[struct.Struct] = struct.Struct("")
 
 
 @dataclass(frozen=True, slots=True)
-class Credit:
+class Credit(_Plain):
     """Host to device: column frames may be sent until they add up to `total_bytes` since the session began."""
 
     TYPE: ClassVar[int] = 0x06
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<Q")
     total_bytes: int
-
-    def to_bytes(self) -> bytes:
-        """As the table CREDIT."""
-        return self._LAYOUT.pack(self.total_bytes)
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls(*_unpack(cls._LAYOUT, payload))
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,23 +253,15 @@ class SweepRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class Calibrate:
+class Calibrate(_Plain):
     """Host to device, CAL: home the table and report the calibration."""
 
     TYPE: ClassVar[int] = 0x11
-
-    def to_bytes(self) -> bytes:
-        """Empty."""
-        return b""
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls()
+    _LAYOUT: ClassVar[struct.Struct] = struct.Struct("")
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class Calibration(_Plain):
     """Device to host, CAL_REPORT: the table stands at home; `calibration` names the settings in use there."""
 
     TYPE: ClassVar[int] = 0x12
@@ -295,50 +269,23 @@ class Calibration:
     calibration: int
     home_encoder: int
 
-    def to_bytes(self) -> bytes:
-        """As the table CAL_REPORT."""
-        return self._LAYOUT.pack(self.calibration, self.home_encoder)
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls(*_unpack(cls._LAYOUT, payload))
-
 
 @dataclass(frozen=True, slots=True)
-class SweepStart:
+class SweepStart(_Plain):
     """Host to device: begin the configured sweep under this number."""
 
     TYPE: ClassVar[int] = 0x20
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<H")
     sweep: int
 
-    def to_bytes(self) -> bytes:
-        """As the table SWEEP_START."""
-        return self._LAYOUT.pack(self.sweep)
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls(*_unpack(cls._LAYOUT, payload))
-
 
 @dataclass(frozen=True, slots=True)
-class SweepStop:
+class SweepStop(_Plain):
     """Host to device: end this sweep early."""
 
     TYPE: ClassVar[int] = 0x21
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<H")
     sweep: int
-
-    def to_bytes(self) -> bytes:
-        """As the table SWEEP_STOP."""
-        return self._LAYOUT.pack(self.sweep)
-
-    @classmethod
-    def from_bytes(cls, payload: Payload) -> Self:
-        """Inverse of to_bytes."""
-        return cls(*_unpack(cls._LAYOUT, payload))
 
 
 @dataclass(frozen=True, slots=True)

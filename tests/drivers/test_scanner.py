@@ -251,6 +251,22 @@ def test_an_error_of_the_scanner_interrupts_the_sweep_with_its_words() -> None:
     assert isinstance(last.cause, ScannerFault)
 
 
+def test_watching_an_idle_scanner_hears_its_errors_and_its_unplugging() -> None:
+    bench = greeted()
+    bench.scanner.watch(1.0)
+    assert bench.port.clock() == pytest.approx(1.0, abs=0.02)
+    bench.port.cancel()
+    bench.scanner.watch(60.0)
+    assert bench.port.clock() < 2.0
+    bench.device._link.send(Fault(3, "jam"))
+    with pytest.raises(ScannerFault, match="jam"):
+        bench.scanner.watch(1.0)
+    assert isinstance(bench.sweep(), SweepFinished)
+    bench.port.unplug()
+    with pytest.raises(PortLost):
+        bench.scanner.watch(60.0)
+
+
 def test_a_caller_that_leaves_at_the_last_event_has_answered_the_scanner() -> None:
     bench = greeted()
     for event in bench.scanner.sweep(SweepRequest()):
