@@ -26,7 +26,6 @@ from protocol.reconstruct import (
     coarse_to_range,
     coarse_to_texture,
     content_hashes,
-    dequantise,
     paste,
     range_patch,
     select,
@@ -128,6 +127,7 @@ class Model:
         coarse_shape = shape.coarse_height, shape.coarse_width
         if refinement.samples != shape.coarse_height * shape.coarse_width:
             raise RemoteWireError(f"{_name(refinement)}: {refinement.samples} samples for {coarse_shape}")
+        _rank(refinement)
         if channel is Channel.RANGE:
             coarse = _decode_range(refinement, coarse_shape)
             _apply_mask(refinement, coarse)
@@ -177,8 +177,7 @@ def spacing_of_levels(held: ChannelHoldings) -> NDArray[np.float32]:
 
 def _decode_range(refinement: Refinement, shape: tuple[int, int]) -> StepArray:
     """Transmitted range in steps, without voids."""
-    values = decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape)
-    return dequantise(values, refinement.quality)
+    return decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape, refinement.quality)
 
 
 def _decode_texture(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:
@@ -194,6 +193,7 @@ def _apply_mask(refinement: Refinement, steps: StepArray) -> None:
 
 
 def _rank(refinement: Refinement) -> int:
+    """How good its values are. Raises LatticeError for a quantum or quality off the scale."""
     rank_of = range_rank if refinement.channel is Channel.RANGE else texture_rank
     return rank_of(refinement.quality)
 

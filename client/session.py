@@ -282,11 +282,11 @@ class Session:
 
     async def _answer(self, updated: m.Updated, size: int) -> None:
         self._check_asked(updated.request)
-        replica, look = self._bound(), self._looking.pop(updated.request, None)
+        replica = self._bound()
         superseded = updated.reason == "superseded"  # may overtake the update in the air, so it says nothing of order
         lost = 0 if superseded else replica.missing(updated)
         self._updates += 1
-        if look is not None:
+        if (look := self._looking.pop(updated.request, None)) is not None:
             look.tally.bytes_received += size
             look.answer.set_result(look.tally.close(updated, lost))
         if lost:

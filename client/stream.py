@@ -86,8 +86,8 @@ async def open_stream(http: aiohttp.ClientSession, url: str, token: str | None) 
             stream = Stream(await _connect(http, url), url)
             try:
                 return stream, await stream.greet(token)
-            except RemoteWireError as violation:
-                await stream.close(violation)
+            except BaseException as error:
+                await stream.close(error if isinstance(error, RemoteWireError) else None)
                 raise
     except TimeoutError as error:
         raise NodeLost(f"{url} does not answer; check the address, or restart the node") from error
@@ -102,7 +102,7 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
             heartbeat=HEARTBEAT_S,
             timeout=ClientWSTimeout(ws_close=CLOSE_S),
         )
-    except (aiohttp.InvalidURL, ValueError) as error:
+    except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, ValueError) as error:
         raise NodeLost(f"{url!r} is no address of a node; use http://HOST:PORT") from error
     except aiohttp.WSServerHandshakeError as error:
         raise _refusal(url, error.status) from error
@@ -112,6 +112,7 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
     except (aiohttp.ClientError, OSError) as error:
         raise NodeLost(f"{url} is no foveascan node: {error}") from error
     if socket.protocol != m.PROTOCOL:
+        await socket.close()
         raise RemoteWireError(f"{url} does not speak {m.PROTOCOL}: update the older of the two")
     return socket
 

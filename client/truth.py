@@ -61,6 +61,6 @@ class Truth:
     def _psnr_db(self, model: Model, u: float, v: float, window: float) -> float:
         height, width = self.texture.shape[:2]
         region = region_round(u, v, window, width, height)
-        held, true = (image[region.rows][:, region.columns].astype(np.float64) for image in (model.texture, self.texture))
-        squared = float(np.mean((held - true) ** 2))
+        held, true = (image[region.rows][:, region.columns] for image in (model.texture, self.texture))
+        squared = float(np.mean((held.astype(np.float64) - true) ** 2))
         return PSNR_MAX_DB if squared == 0 else min(10 * math.log10(255**2 / squared), PSNR_MAX_DB)
