@@ -164,20 +164,26 @@ def texture_patch(selection: Selection, texels: ImageArray) -> ImageArray:
     y, x = selection.y, selection.x
     _check_samples(selection, texels.shape[:2])
     patch = np.empty((y.low.size, x.low.size, 3), np.uint8)
-    part_x = (x.part / x.whole).astype(np.float32)[None, :, None]
-    part_y = (y.part / y.whole).astype(np.float32)[:, None, None]
+    part_x, part_y = x.part / x.whole, y.part / y.whole
     for top in range(0, y.low.size, BAND_ROWS):
         band = slice(top, top + BAND_ROWS)
-        rows = _lerp(texels[y.low[band]], texels[y.high[band]], part_y[band])
-        patch[band] = _lerp(rows[:, x.low], rows[:, x.high], part_x) + np.float32(0.5)
+        low, high = y.low[band], y.high[band]
+        few = texels[low[0] : high[-1] + 1].swapaxes(0, 1)
+        columns = _between(few, x.low, x.high, part_x).swapaxes(0, 1)
+        patch[band] = _between(columns, low - low[0], high - low[0], part_y[band]) + np.float32(0.5)
     return patch
 
 
-def _lerp(low: ImageArray | LightArray, high: ImageArray | LightArray, part: LightArray) -> LightArray:
-    start = low.astype(np.float32)
-    if not part.any():
-        return start
-    return start + (high.astype(np.float32) - start) * part
+def _between(samples: ImageArray | LightArray, low: IntArray, high: IntArray, part: FloatArray) -> LightArray:
+    """Linear interpolation along axis 0: samples[low], part (n,) of the way to samples[high]. (n, ..., 3) float32."""
+    source = np.ascontiguousarray(samples, np.float32)
+    start = source[low]
+    if part.any():
+        way = source[high]
+        way -= start
+        way *= part.astype(np.float32)[:, None, None]
+        start += way
+    return start
 
 
 def paste(dense: StepArray | ImageArray, patch: StepArray | ImageArray, selection: Selection) -> None:
