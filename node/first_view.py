@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from node.coded import FRAME_BYTES
 from node.library import Scan
 from node.state import ClientState, first_state
-from protocol.codec import RangeCodec, TextureCodec, encode_mask, encode_range, encode_texture
+from protocol.codec import RangeCodec, TextureCodec, decode_range, encode_mask, encode_range, encode_texture
 from protocol.errors import CodecError
 from protocol.grid import VOID
 from protocol.lattice import Channel
 from protocol.messages import CodecName, ScanInfo
-from protocol.reconstruct import dequantise, quantise
 from protocol.refinement import CRC, HEADER, Generator, Refinement
 
 QUANTUM_MM = 0.05
@@ -40,14 +39,13 @@ def build_first_view(scan: Scan, codec: CodecName, max_bytes: int) -> FirstView:
     """Encode a scan's first view within max_bytes. Raises CodecError when even the poorest texture is too large."""
     coarse = scan.coarse
     quantum = max(1, round(QUANTUM_MM / scan.spec.step_mm))
-    values = quantise(coarse.filled, quantum)
     mask = encode_mask(~coarse.measured)
-    payload = encode_range(values, RangeCodec.HTJ2K)
+    payload = encode_range(coarse.filled, RangeCodec.LIFT, quantum)
     view = Refinement(
-        Generator.COARSE, Channel.RANGE, 0, 0, 0, RangeCodec.HTJ2K, quantum, coarse.filled.size, payload, mask
+        Generator.COARSE, Channel.RANGE, 0, 0, 0, RangeCodec.LIFT, quantum, coarse.filled.size, payload, mask
     )
     left = max_bytes - OPENED_BYTES - 2 * OVERHEAD_BYTES - len(payload) - len(mask)
-    sent = dequantise(values, quantum)
+    sent = decode_range(payload, RangeCodec.LIFT, coarse.filled.shape, quantum)
     sent[~coarse.measured] = VOID
     return FirstView(scan_info(scan), view, _texture(scan, codec, left), first_state(scan, sent))
 

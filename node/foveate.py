@@ -128,9 +128,10 @@ class _Planner:
         self._limited = True
 
     def _refine_texture(self) -> None:
-        spacing = choose_spacing(self._scan, self._state, self._texture_region, self._look.texture_db)
+        look = self._look
+        finest = choose_spacing(self._scan, self._state, self._texture_region, look.texture_db, self._codec)
         found = None
-        for p in _wider_or_equal(spacing.p):
+        for p in (spacing for spacing in reversed(SPACINGS) if spacing >= finest):
             found = self._search_quality(p)
             if found is not None or not self._limited:
                 break
@@ -190,10 +191,6 @@ def _coarser_range(first: RangeParameters, width: int) -> Iterator[RangeParamete
     for p in (1, 2, 4, 8):
         if p >= first.p and width % p == 0:
             yield RangeParameters(p=p, quantum=max(first.quantum, 2) * (4 if p == first.p else 1), s=None)
-
-
-def _wider_or_equal(p: float) -> Iterator[float]:
-    return iter(sorted(spacing for spacing in SPACINGS if spacing >= p))
 
 
 def _error_in(state: ClientState, region: Region) -> float:

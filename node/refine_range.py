@@ -1,7 +1,7 @@
 """Range for a look: which spacing and quantum reach the quality asked for, and the refinement that carries them.
 
-Bytes hang on the spacing far more than on the quantum, so the widest spacing that can reach the quality wins, and then
-the largest quantum that still does. Every trial is reconstructed and compared with the scan, as the client will see it.
+At every spacing that can reach the quality, the largest quantum that still does is found; the pair expected to take the
+fewest bytes wins. Every trial is reconstructed and compared with the scan, as the client will see it.
 """
 
 from __future__ import annotations
@@ -15,40 +15,46 @@ from node.library import Scan
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask, encode_range
+from protocol.codec_lift import survey
 from protocol.grid import VOID, StepArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
-from protocol.reconstruct import Selection, content_hashes, cut, dequantise, quantise, range_patch, select
+from protocol.reconstruct import Selection, content_hashes, cut, range_patch, select
 from protocol.region import Region
 
 PERCENTILE = 99
 QUANTUM_MAX = 4096
+QUANTUM_SHARE_MAX = 2.5  # of the target; the error is at most half a quantum, less after interpolation
 SKIRT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A spacing and quantum, and the error they leave in the region. [steps]"""
+    """A spacing and quantum, the error they leave in the region [steps], and about how many bytes they take."""
 
     parameters: RangeParameters
     error: float
+    expected_bytes: float
 
 
 def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: float) -> Choice:
     """The cheapest parameters whose error in the region is at most target_steps (99th percentile, "higher")."""
     fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
-    finest: Choice | None = None
+    best: Choice | None = None
     for p in (8, 4, 2, 1):
         selection = _trial_selection(fresh, region, p)
         if selection is None or (p > 1 and target_steps < 1):
             continue
         trial = _Trial(scan, selection, region)
-        if trial.error(1) <= target_steps:
-            quantum = _largest_quantum(trial, target_steps)
-            return Choice(RangeParameters(p=p, quantum=quantum, s=SKIRT_S), trial.error(quantum))
-        finest = Choice(RangeParameters(p=p, quantum=1, s=SKIRT_S), trial.error(1))
-    return finest or Choice(RangeParameters(p=1, quantum=1, s=SKIRT_S), 0.0)
+        if trial.error(1) > target_steps:
+            continue
+        quantum = _largest_quantum(trial, target_steps)
+        size_bytes = trial.expected_bytes(quantum)
+        if best is not None and size_bytes >= best.expected_bytes:
+            break
+        best = Choice(RangeParameters(p=p, quantum=quantum, s=SKIRT_S), trial.error(quantum), size_bytes)
+    return best or Choice(RangeParameters(p=1, quantum=1, s=SKIRT_S), 0.0, 0.0)
 
 
 def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangeParameters) -> Coded | None:
@@ -65,8 +71,9 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
         return None
     selection, adopted = found
     void = void_cells(scan, selection)
-    payload = encode_range(quantise(range_samples(scan, selection), quantum), RangeCodec.HTJ2K)
-    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.HTJ2K, payload, encode_mask(void))
+    samples, seen = range_samples(scan, selection)
+    payload = encode_range(samples, RangeCodec.LIFT, quantum, seen)
+    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, encode_mask(void))
 
 
 def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
@@ -77,8 +84,10 @@ def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
 
 def client_patch(scan: Scan, coded: Coded) -> StepArray:
     """The dense range a client makes of a refinement, voids included. (rows, columns) uint16."""
-    patch = _patch(scan, coded.selection, coded.quality)
-    patch[void_cells(scan, coded.selection)] = VOID
+    selection = coded.selection
+    samples, seen = range_samples(scan, selection)
+    patch = range_patch(selection, survey(samples, coded.quality, seen)[0])
+    patch[void_cells(scan, selection)] = VOID
     return patch
 
 
@@ -98,36 +107,35 @@ class _Trial:
 
     def __init__(self, scan: Scan, selection: Selection, region: Region) -> None:
         self._selection = selection
-        self._samples = range_samples(scan, selection)
+        self._samples, self._seen = range_samples(scan, selection)
         top, left = region.top - selection.y.start, (region.left - selection.x.start) % region.turn
         columns = (left + np.arange(region.width)) % region.turn
         self._place = np.ix_(np.arange(top, top + region.height), columns)
         truth = scan.range_steps[region.rows][:, region.columns]
         self._measured = truth != VOID
         self._truth = truth[self._measured].astype(np.int32)
-        self._known: dict[int, float] = {}
+        self._known: dict[int, tuple[float, float]] = {}
 
     def error(self, quantum: int) -> float:
         """99th percentile ("higher") of the error over measured cells of the region. [steps]"""
-        if quantum not in self._known:
-            self._known[quantum] = self._measure(quantum)
-        return self._known[quantum]
+        return self._measure(quantum)[0]
 
-    def _measure(self, quantum: int) -> float:
-        if not self._truth.size:
-            return 0.0
-        samples = dequantise(quantise(self._samples, quantum), quantum)
-        patch = range_patch(self._selection, samples)[self._place]
-        return percentile_higher(np.abs(patch[self._measured].astype(np.int32) - self._truth), PERCENTILE)
+    def expected_bytes(self, quantum: int) -> float:
+        """About how many bytes the refinement takes."""
+        return self._measure(quantum)[1]
+
+    def _measure(self, quantum: int) -> tuple[float, float]:
+        if quantum not in self._known:
+            samples, size_bytes = survey(self._samples, quantum, self._seen)
+            patch = range_patch(self._selection, samples)[self._place]
+            error = np.abs(patch[self._measured].astype(np.int32) - self._truth)
+            self._known[quantum] = percentile_higher(error, PERCENTILE) if error.size else 0.0, size_bytes
+        return self._known[quantum]
 
 
 def percentile_higher(values: np.ndarray, percent: float) -> float:
     """Percentile of a non-empty array, the next higher value where it falls between two."""
     return float(np.percentile(values, percent, method="higher"))
-
-
-def _patch(scan: Scan, selection: Selection, quantum: int) -> StepArray:
-    return range_patch(selection, dequantise(quantise(range_samples(scan, selection), quantum), quantum))
 
 
 def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:
@@ -146,9 +154,9 @@ def _trial_selection(fresh: ChannelHoldings, region: Region, p: int) -> Selectio
 
 
 def _largest_quantum(trial: _Trial, target_steps: float) -> int:
-    """Largest quantum that keeps the region's error within target_steps, to a twentieth."""
-    low, high = 1, min(max(int(2.5 * target_steps), 1), QUANTUM_MAX)
-    while high - low > max(low // 20, 0) and high > low:
+    """Largest quantum that keeps the region's error within target_steps, to a tenth."""
+    low, high = 1, min(max(int(QUANTUM_SHARE_MAX * target_steps), 1), QUANTUM_MAX)
+    while high - low > low // 10:
         middle = (low + high + 1) // 2
         if trial.error(middle) <= target_steps:
             low = middle

@@ -15,12 +15,34 @@ from protocol.lattice import Axis
 from protocol.reconstruct import Selection, cut
 
 
-def range_samples(scan: Scan, selection: Selection) -> StepArray:
-    """Filled range at the transmitted positions. sample_shape uint16."""
+def range_samples(scan: Scan, selection: Selection) -> tuple[StepArray, BoolArray]:
+    """Filled range at the transmitted positions, and which of these values anyone will see. sample_shape each.
+
+    Seen are samples of adopted blocks that are measured or, where cells between samples hang on them, near such.
+    """
     lattice = selection.lattice
     rows = lattice.y.border[selection.y.sample] // 2
     columns = lattice.x.border[selection.x.sample] // 2 % scan.spec.width
-    return np.asarray(scan.filled[rows][:, columns])
+    seen = np.asarray(scan.range_steps[rows][:, columns]) != VOID
+    if lattice.parameters.half_spacing > 2:
+        seen = cv2.dilate(seen.view(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
+    if not selection.adopted.all():
+        seen &= _stencil(selection)
+    return np.asarray(scan.filled[rows][:, columns]), seen
+
+
+def _stencil(selection: Selection) -> BoolArray:
+    """Which transmitted samples are corners of an adopted cell's stencil. sample_shape bool."""
+    cells = selection.adopted_cells()
+    y, x = selection.y, selection.x
+    needed = np.zeros(selection.sample_shape, np.bool_)
+    by_row = np.zeros((y.sample.size, cells.shape[1]), np.bool_)
+    for side, weight in ((y.low, y.whole - y.part), (y.high, y.part)):
+        np.logical_or.at(by_row, side[weight > 0], cells[weight > 0])
+    columns = needed.T
+    for side, weight in ((x.low, x.whole - x.part), (x.high, x.part)):
+        np.logical_or.at(columns, side[weight > 0], by_row.T[weight > 0])
+    return needed
 
 
 def void_cells(scan: Scan, selection: Selection) -> BoolArray:

@@ -14,9 +14,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from protocol import codec_htj2k, codec_jpeg, codec_mask
+from protocol import codec_htj2k, codec_jpeg, codec_lift, codec_mask
 from protocol.errors import CodecError
-from protocol.grid import BoolArray, ImageArray, StepArray
+from protocol.grid import BoolArray, ImageArray, StepArray, dequantise, quantise
 
 LOSSLESS = codec_htj2k.LOSSLESS
 LOSSY_MAX = codec_htj2k.LOSSY_MAX
@@ -36,6 +36,7 @@ class RangeCodec(IntEnum):
 
     RAW = 0
     HTJ2K = 2
+    LIFT = 3
 
 
 # Q of the JPEG whose PSNR equals that of HTJ2K, for each quality from JPEG_QUALITY_MIN on: medians over 30 patches of
@@ -69,22 +70,31 @@ def decode_texture(payload: bytes, codec: TextureCodec, quality: int, shape: tup
     return codec_htj2k.decode(payload, (*shape, 3), quality)
 
 
-def encode_range(values: StepArray, codec: RangeCodec) -> bytes:
-    """Payload of (h, w) uint16 values, exactly. Raises CodecError for an array that is not that."""
-    _check_array(values, np.uint16, 1)
-    if codec == RangeCodec.RAW:
-        return values.astype("<u2").tobytes()
-    return codec_htj2k.encode(values, LOSSLESS)
+def encode_range(
+    range_steps: StepArray, codec: RangeCodec, quantum: int = 1, care: BoolArray | None = None
+) -> bytes:
+    """Payload of (h, w) uint16 steps without voids, each to within quantum // 2 steps; exact at quantum 1.
+
+    care : (h, w) bool, False where any value will do (LIFT spends nothing there).
+    Raises CodecError for an array that is not that.
+    """
+    _check_array(range_steps, np.uint16, 1)
+    if codec == RangeCodec.LIFT:
+        return codec_lift.encode(range_steps, quantum, care)
+    values = quantise(range_steps, quantum)
+    return values.astype("<u2").tobytes() if codec == RangeCodec.RAW else codec_htj2k.encode(values, LOSSLESS)
 
 
-def decode_range(payload: bytes, codec: RangeCodec, shape: tuple[int, int]) -> StepArray:
-    """(h, w) uint16 of a payload, shape = (h, w). Raises CodecError."""
+def decode_range(payload: bytes, codec: RangeCodec, shape: tuple[int, int], quantum: int = 1) -> StepArray:
+    """(h, w) uint16 steps of a payload, 1..65535, shape = (h, w). Raises CodecError."""
     _check_payload(payload, shape, 2)
+    if codec == RangeCodec.LIFT:
+        return codec_lift.decode(payload, shape, quantum)
     if codec == RangeCodec.HTJ2K:
-        return codec_htj2k.decode(payload, shape, LOSSLESS)
+        return dequantise(codec_htj2k.decode(payload, shape, LOSSLESS), quantum)
     if len(payload) != 2 * shape[0] * shape[1]:
         raise CodecError(f"raw range of {shape} takes {2 * shape[0] * shape[1]} bytes, got {len(payload)}")
-    return np.frombuffer(payload, "<u2").astype(np.uint16).reshape(shape)
+    return dequantise(np.frombuffer(payload, "<u2").astype(np.uint16).reshape(shape), quantum)
 
 
 def encode_mask(mask: BoolArray) -> bytes:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-
 VOID = 0
 STEPS_MAX = 65535
 WIDTH_MAX = 16384
@@ -112,6 +111,17 @@ def mm_to_steps(range_mm: NDArray[np.floating], step_mm: float) -> StepArray:
     if steps.size and not (1 <= steps.min() and steps.max() <= STEPS_MAX):
         raise ValueError(f"range outside 1..{STEPS_MAX} steps of {step_mm} mm")
     return np.where(measured, steps, VOID).astype(np.uint16)
+
+
+def quantise(range_steps: StepArray, quantum: int) -> StepArray:
+    """Range to multiples of `quantum` steps: k = (z + quantum // 2) // quantum, same shape, uint16."""
+    return ((range_steps.astype(np.uint32) + np.uint32(quantum // 2)) // np.uint32(quantum)).astype(np.uint16)
+
+
+def dequantise(values: StepArray, quantum: int) -> StepArray:
+    """Inverse of quantise, to within quantum // 2 steps: clamp(k quantum, 1, 65535); never void."""
+    range_steps: StepArray = np.clip(values.astype(np.uint32) * np.uint32(quantum), 1, STEPS_MAX).astype(np.uint16)
+    return range_steps
 
 
 def _check_between(name: str, value: float, low: float, high: float) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.errors import LatticeError
-from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, ImageArray, IntArray, StepArray
+from protocol.grid import VOID, BoolArray, FloatArray, ImageArray, IntArray, StepArray
 from protocol.holdings import ChannelHoldings, HashArray, hash_blocks
 from protocol.lattice import QUARTERS, Axis, ChannelShape, Lattice
 
@@ -118,17 +118,6 @@ def _window(axis: Axis, begin: int, end: int) -> Window:
         part, whole = position - at[index], at[index + 1] - at[index]
     size = axis.stop[begin:end] - axis.start[begin:end]
     return Window(axis.block[begin:end], size, start, sample, low, high, part, whole)
-
-
-def quantise(range_steps: StepArray, quantum: int) -> StepArray:
-    """Range to multiples of `quantum` steps: k = (z + quantum // 2) // quantum, same shape, uint16."""
-    return ((range_steps.astype(np.uint32) + np.uint32(quantum // 2)) // np.uint32(quantum)).astype(np.uint16)
-
-
-def dequantise(values: StepArray, quantum: int) -> StepArray:
-    """Inverse of quantise, to within quantum // 2 steps: clamp(k quantum, 1, 65535); never void."""
-    range_steps: StepArray = np.clip(values.astype(np.uint32) * np.uint32(quantum), 1, STEPS_MAX).astype(np.uint16)
-    return range_steps
 
 
 def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:

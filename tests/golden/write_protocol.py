@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from protocol import messages as m
 from protocol.errors import FoveascanError
+from protocol.grid import dequantise, quantise
 from protocol.holdings import ChannelHoldings, Holdings, hash_blocks, mix32, range_rank, texture_rank
 from protocol.lattice import (
     RHO_MAX,
@@ -37,9 +38,7 @@ from protocol.reconstruct import (
     coarse_to_range,
     coarse_to_texture,
     content_hashes,
-    dequantise,
     paste,
-    quantise,
     range_patch,
     select,
     texture_patch,

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from protocol import codec, codec_htj2k, codec_jpeg
+from protocol import codec, codec_htj2k, codec_jpeg, codec_lift
 from protocol.codec import RangeCodec, TextureCodec
 from protocol.errors import CodecError
 from protocol.grid import BoolArray, ImageArray, StepArray
@@ -29,6 +29,7 @@ SHAPES = [(1, 1), (1, 9), (9, 1), (2, 2), (7, 33), (40, 30), (64, 130), (257, 64
 QUALITIES = {TextureCodec.JPEG: (12, 40, 53), TextureCodec.HTJ2K: (0, 40, 95)}
 LOSSY = [(kind, quality) for kind, qualities in QUALITIES.items() for quality in qualities]
 shapes = st.tuples(st.integers(1, 40), st.integers(1, 40))
+measured = shapes.flatmap(lambda shape: arrays(np.uint16, shape, elements=st.integers(1, 65535)))
 
 
 def texture(shape: tuple[int, int]) -> ImageArray:
@@ -58,10 +59,28 @@ def test_range_returns_exactly(shape: tuple[int, int], kind: RangeCodec) -> None
 
 
 @settings(max_examples=60, deadline=None)
-@given(shapes.flatmap(lambda shape: arrays(np.uint16, shape)))
-def test_any_range_returns_exactly(values: StepArray) -> None:
-    payload = codec.encode_range(values, RangeCodec.HTJ2K)
-    np.testing.assert_array_equal(codec.decode_range(payload, RangeCodec.HTJ2K, values.shape), values)
+@given(measured, st.sampled_from(RangeCodec))
+def test_any_range_returns_exactly(values: StepArray, kind: RangeCodec) -> None:
+    payload = codec.encode_range(values, kind)
+    np.testing.assert_array_equal(codec.decode_range(payload, kind, values.shape), values)
+
+
+@settings(max_examples=100, deadline=None)
+@given(measured, st.integers(1, 65534), st.sampled_from(RangeCodec), st.integers(0, 2**32 - 1))
+def test_any_range_returns_within_half_a_quantum(values: StepArray, quantum: int, kind: RangeCodec, seed: int) -> None:
+    care = np.random.default_rng(seed).random(values.shape) < 0.7
+    decoded = codec.decode_range(codec.encode_range(values, kind, quantum, care), kind, values.shape, quantum)
+    far = np.abs(decoded.astype(int) - values) > quantum // 2
+    assert not (far & care).any() if kind is RangeCodec.LIFT and max(values.shape) > 2 else not far.any()
+
+
+def test_lift_surveys_what_it_decodes_to() -> None:
+    values = ranges((33, 40))
+    care = discs((33, 40))
+    decoded, expected_bytes = codec_lift.survey(values, 300, care)
+    payload = codec_lift.encode(values, 300, care)
+    np.testing.assert_array_equal(decoded, codec_lift.decode(payload, (33, 40), 300))
+    assert 0.5 < expected_bytes / len(payload) < 2
 
 
 @settings(max_examples=60, deadline=None)
@@ -222,6 +241,10 @@ DECODERS: dict[str, tuple[bytes, Decoder]] = {
     "range": (
         codec.encode_range(ranges((33, 40)), RangeCodec.HTJ2K),
         lambda payload, shape: codec.decode_range(payload, RangeCodec.HTJ2K, shape),
+    ),
+    "lift": (
+        codec.encode_range(ranges((33, 40)), RangeCodec.LIFT, 7),
+        lambda payload, shape: codec.decode_range(payload, RangeCodec.LIFT, shape, 7),
     ),
     "raw": (
         codec.encode_range(ranges((33, 40)), RangeCodec.RAW),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.errors import LatticeError
-from protocol.grid import BoolArray, ImageArray, StepArray
+from protocol.grid import BoolArray, ImageArray, StepArray, dequantise, quantise
 from protocol.holdings import ChannelHoldings, hash_blocks, range_rank, texture_rank
 from protocol.lattice import RHO_ONE, Channel, ChannelShape, Parameters, build_lattice
 from protocol.reconstruct import (
@@ -17,9 +17,7 @@ from protocol.reconstruct import (
     coarse_to_texture,
     content_hashes,
     cut,
-    dequantise,
     paste,
-    quantise,
     range_patch,
     select,
     texture_patch,
