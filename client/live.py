@@ -47,10 +47,8 @@ class Picture:
         self.sweep = started.sweep
         self._grid = started.grid
         shapes = {channel: (s.coarse_width, s.coarse_height) for channel, s in started.grid.shapes().items()}
-        self._samples: dict[Channel, StepArray | ImageArray] = {
-            Channel.RANGE: np.zeros(shapes[Channel.RANGE], np.uint16),
-            Channel.TEXTURE: np.zeros((*shapes[Channel.TEXTURE], 3), np.uint8),
-        }
+        self._range: StepArray = np.zeros(shapes[Channel.RANGE], np.uint16)
+        self._texture: ImageArray = np.zeros((*shapes[Channel.TEXTURE], 3), np.uint8)
         self._seen = {channel: np.zeros(shape[0], np.bool_) for channel, shape in shapes.items()}
         self._progress = m.LiveProgress(started.sweep, 0.0)
         self.ended: m.LiveEnded | None = None
@@ -74,16 +72,16 @@ class Picture:
         ended = self.ended or m.LiveEnded(self.sweep, "interrupted")
         return LiveFrame(
             self.sweep, self._progress.percent, self._progress.seconds_left,
-            self._samples[Channel.RANGE].T.copy(), self._seen[Channel.RANGE].copy(),
-            self._samples[Channel.TEXTURE].swapaxes(0, 1).copy(), self._seen[Channel.TEXTURE].copy(),
+            self._range.T.copy(), self._seen[Channel.RANGE].copy(),
+            self._texture.swapaxes(0, 1).copy(), self._seen[Channel.TEXTURE].copy(),
             self._grid, ended.reason if self.ended else "", ended.scan, ended.why,
         )  # fmt: skip
 
     def _take_columns(self, said: LiveColumns) -> None:
-        samples, columns = self._samples[said.channel], list(said.columns)
-        if said.rows != samples.shape[1] or max(columns) >= samples.shape[0]:
-            raise RemoteWireError(f"live columns of {said.rows} samples, up to {max(columns)}, in {samples.shape}")
-        samples[columns] = said.samples
+        thinned, columns = self._range if said.channel is Channel.RANGE else self._texture, list(said.columns)
+        if said.rows != thinned.shape[1] or max(columns) >= thinned.shape[0]:
+            raise RemoteWireError(f"live columns of {said.rows} samples, up to {max(columns)}, in {thinned.shape[:2]}")
+        thinned[columns] = said.samples
         self._seen[said.channel][columns] = True
 
 
@@ -102,6 +100,8 @@ class LiveFeed:
             self._picture = Picture(said)
         elif self._picture is not None:  # else it was on its way when the last watcher left
             self._picture.take(said)
+            if isinstance(said, m.LiveEnded):
+                self._picture = None
         self._tell()
 
     def forget(self) -> None:
@@ -115,15 +115,14 @@ class LiveFeed:
 
     async def frames(self) -> AsyncIterator[LiveFrame]:
         """Frames of the sweep that runs, else of the next, as they change, up to its end. Raises what ends the feed."""
-        while (picture := self._picture) is None or picture.ended:
-            if await self._wait():
-                return
-        shown = -1
+        picture, shown = self._picture, -1
         while True:
-            if picture.changes > shown:
-                shown = picture.changes
-                yield picture.frame()
-                if picture.ended and picture.changes == shown:
+            if picture is None:
+                picture = self._picture
+            if picture is not None and picture.changes > shown:
+                shown, frame = picture.changes, picture.frame()
+                yield frame
+                if frame.ended:
                     return
             elif await self._wait():
                 return

@@ -11,7 +11,7 @@ import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 from weakref import WeakSet
 
 import aiohttp
@@ -19,22 +19,24 @@ import msgspec
 
 from client.discovery import NodeAddress
 from client.errors import NodeLost, RequestRefused
+from client.live import LiveFeed, LiveFrame
 from client.model import Applied, Model
 from client.news import News
 from client.replica import Replica
+from client.rest import ask
 from client.stream import Stream, open_stream
 from client.update import Tally, Update
 from protocol import messages as m
 from protocol.errors import LocalWireError, RemoteWireError
 from protocol.holdings import LevelArray, RankArray
 from protocol.lattice import Channel
+from protocol.live import LiveColumns
 from protocol.refinement import Generator, Refinement
 from protocol.session import Said
 
-REPLY_MAX_BYTES = 4 << 20
-HTTP_TIMEOUT = aiohttp.ClientTimeout(total=30)
-
 log = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer", Model, Update)
 
 
 class Held(NamedTuple):
@@ -64,8 +66,8 @@ class _Looking:
     tally: Tally
     answer: asyncio.Future[Update]
 
-    def supersede(self) -> None:
-        self.answer.set_result(self.tally.close(m.Updated(self.tally.request, 0, "superseded")))
+    def close(self, said: m.Updated, lost: int = 0) -> None:
+        _settle(self.answer, self.tally.close(said, lost))
 
 
 @asynccontextmanager
@@ -97,6 +99,7 @@ class Session:
         self._opening: dict[int, asyncio.Future[Model]] = {}
         self._looking: dict[int, _Looking] = {}
         self._news: WeakSet[News] = WeakSet()
+        self._live = LiveFeed()
         self._refinements = self._samples = self._updates = self._resyncs = 0
         self._apply_s = 0.0
         self._ended: Exception | None = None
@@ -177,7 +180,7 @@ class Session:
                 fill,
                 profile,
                 parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
-            )  # fmt: skip
+            )
         )
         answer: asyncio.Future[Update] = asyncio.get_running_loop().create_future()
         self._looking[request] = _Looking(Tally(request), answer)
@@ -200,24 +203,44 @@ class Session:
             news.end(self._ended)
         return news
 
+    async def live(self) -> AsyncIterator[LiveFrame]:
+        """The sweep that runs, else the next one, as it comes in: `async for frame in session.live()`.
+
+        Frames follow each other as fast as they are read; the last one says how the sweep ended. Watching costs the
+        link two bytes a cell and three a texel of the first view, once in a sweep. Raises what ends the session.
+        """
+        self._live.watchers += 1
+        try:
+            if self._live.watchers == 1:
+                await self._send(m.Watch(True))
+            async for frame in self._live.frames():
+                yield frame
+        finally:
+            self._live.watchers -= 1
+            if not self._live.watchers:
+                self._live.forget()
+                if self._ended is None:
+                    with suppress(NodeLost):
+                        await self._send(m.Watch(False))
+
     async def scans(self) -> list[dict[str, Any]]:
         """The scans in the node's library, newest first, as GET /v1/scans describes them."""
-        return list(await self._ask("GET", "/v1/scans"))
+        return list(await ask(self._http, "GET", f"{self._stream.url}/v1/scans"))
 
     async def scanner(self) -> dict[str, Any]:
-        """What the node's scanner is doing: phase, progress 0..1, sweeps finished, why the last one failed."""
-        return dict((await self._ask("GET", "/v1/node"))["capture"])
+        """What the node's scanner is doing, as GET /v1/node says under "capture": phase, progress, sweeps, why."""
+        return dict((await ask(self._http, "GET", f"{self._stream.url}/v1/node"))["capture"])
 
     async def start_sweep(self) -> dict[str, Any]:
         """Start a sweep. Returns at once with what POST /v1/sweeps says; the scan is announced by `published`."""
-        return dict(await self._ask("POST", "/v1/sweeps"))
+        return dict(await ask(self._http, "POST", f"{self._stream.url}/v1/sweeps"))
 
     async def close(self) -> None:
         """End the session; whoever still waits gets NodeLost. `connect` does this at the end of its block."""
         self._reader.cancel()
         await asyncio.gather(self._reader, return_exceptions=True)
         if self._applying is not None:
-            await asyncio.wait([self._applying])
+            await asyncio.gather(self._applying, return_exceptions=True)
         self._end(NodeLost("the session was closed"), on_purpose=True)
         await self._stream.close()
 
@@ -248,6 +271,8 @@ class Session:
             case m.Published(scan=scan):
                 for news in list(self._news):
                     news.tell(scan)
+            case LiveColumns() | m.LiveStarted() | m.LiveProgress() | m.LiveEnded():
+                self._live.take(said)
             case m.Goodbye(reason=reason):
                 raise NodeLost(f"{self._stream.url} ended the stream: {reason}")
 
@@ -269,16 +294,15 @@ class Session:
             await self._first_view(replica)
 
     async def _first_view(self, replica: Replica) -> None:
-        waiting = self._opening.pop(replica.request, None)
-        if waiting is not None:
-            waiting.set_result(replica.model)
+        if (waiting := self._opening.pop(replica.request, None)) is not None:
+            _settle(waiting, replica.model)
         await self._stream.send(replica.acknowledge())
 
     def _bind(self, opened: m.Opened) -> None:
         self._check_asked(opened.request)
         self._replica = Replica(opened)
         for older in [request for request in self._looking if request < opened.request]:
-            self._looking.pop(older).supersede()
+            self._looking.pop(older).close(m.Updated(older, 0, "superseded"))
 
     async def _answer(self, updated: m.Updated, size: int) -> None:
         self._check_asked(updated.request)
@@ -288,7 +312,7 @@ class Session:
         self._updates += 1
         if (look := self._looking.pop(updated.request, None)) is not None:
             look.tally.bytes_received += size
-            look.answer.set_result(look.tally.close(updated, lost))
+            look.close(updated, lost)
         if lost:
             await self._state(replica.object())
         elif not superseded:
@@ -302,9 +326,9 @@ class Session:
     def _refuse(self, refused: m.Refused) -> None:
         error = RequestRefused(refused.code, refused.message)
         if (look := self._looking.pop(refused.request, None)) is not None:
-            look.answer.set_exception(error)
+            _settle(look.answer, error)
         elif (opening := self._opening.pop(refused.request, None)) is not None:
-            opening.set_exception(error)
+            _settle(opening, error)
         else:
             log.warning("%s, about request %d, which nobody waits for", error, refused.request)
 
@@ -312,13 +336,14 @@ class Session:
         if self._ended is None:
             self._ended = cause
             for opening in self._opening.values():
-                opening.set_exception(cause)
+                _settle(opening, cause)
             for look in self._looking.values():
-                look.answer.set_exception(cause)
+                _settle(look.answer, cause)
             self._opening.clear()
             self._looking.clear()
             for news in list(self._news):
                 news.end(None if on_purpose else cause)
+            self._live.end(None if on_purpose else cause)
 
     # Asking
 
@@ -345,13 +370,15 @@ class Session:
             raise LocalWireError("no scan is open; await session.open(...) first")
         return self.model
 
-    async def _ask(self, method: str, path: str) -> Any:
-        """JSON of an HTTP request. Raises RequestRefused, NodeLost, RemoteWireError."""
-        try:
-            async with self._http.request(method, f"{self._stream.url}{path}", timeout=HTTP_TIMEOUT) as response:
-                return _reply(response.status, await _bounded_body(response))
-        except (aiohttp.ClientError, OSError) as error:
-            raise NodeLost(f"lost {self._stream.url}: {error}") from error
+
+def _settle(answer: asyncio.Future[Answer], value: Answer | Exception) -> None:
+    """Give an answer to whoever waits for it, unless they were cancelled in this very turn of the loop."""
+    if answer.done():
+        return
+    if isinstance(value, Exception):
+        answer.set_exception(value)
+    else:
+        answer.set_result(value)
 
 
 def _checked_look(look: m.Look) -> m.Look:
@@ -359,23 +386,3 @@ def _checked_look(look: m.Look) -> m.Look:
         return msgspec.convert(msgspec.to_builtins(look), m.Look)
     except (msgspec.ValidationError, TypeError) as error:
         raise LocalWireError(f"look: {error}") from None
-
-
-async def _bounded_body(response: aiohttp.ClientResponse) -> bytes:
-    body = bytearray()
-    async for chunk in response.content.iter_any():
-        body += chunk
-        if len(body) > REPLY_MAX_BYTES:
-            raise RemoteWireError(f"{response.url} sends more than {REPLY_MAX_BYTES} bytes")
-    return bytes(body)
-
-
-def _reply(status: int, body: bytes) -> Any:
-    try:
-        reply = msgspec.json.decode(body)
-    except (msgspec.DecodeError, UnicodeError) as error:
-        raise RemoteWireError(f"HTTP {status} without a JSON body: {error}") from None
-    if status >= 400:
-        said = reply if isinstance(reply, dict) else {}
-        raise RequestRefused(str(said.get("code", f"HTTP {status}")), str(said.get("message", "")))
-    return reply

@@ -15,6 +15,7 @@ from client import NodeLost, RequestRefused, Session, connect
 from client import stream as client_stream
 from client.discovery import NodeAddress
 from client.model import Model
+from client.update import Tally, Update
 from protocol import messages as m
 from protocol.errors import FoveascanError, LocalWireError, RemoteWireError
 from protocol.grid import VOID
@@ -338,6 +339,33 @@ async def test_a_cancelled_look_is_cancelled_at_the_node_and_its_answer_ignored(
         await cancelled.wait()
         assert (await session.look(0.5, 0.5)).samples > 0
         assert np.array_equal(model.range_steps[16:32, 24:48], GRID.range_steps[16:32, 24:48])
+
+
+async def test_an_answer_to_a_look_cancelled_in_the_same_moment_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks: list[asyncio.Task[Update]] = []
+    close = Tally.close
+
+    def cancelled(tally: Tally, said: m.Updated, lost: int = 0) -> Update:
+        if looks:
+            looks.pop().cancel()
+        return close(tally, said, lost)
+
+    monkeypatch.setattr(Tally, "close", cancelled)
+
+    async def script(line: Line) -> None:
+        planner = Planner(GRID)
+        await show(line, planner)
+        while True:
+            said = await line.hear()
+            if isinstance(said, m.Look):
+                await line.say(updated(planner, said.request))
+
+    async with session_with(script) as session:
+        await session.open()
+        looks.append(asyncio.create_task(session.look(0.4, 0.4)))
+        with pytest.raises(asyncio.CancelledError):
+            await looks[0]
+        assert (await session.look(0.4, 0.4)).reason == "complete"
 
 
 # What the caller gets wrong

@@ -1,0 +1,43 @@
+"""Requests beside the stream: JSON over HTTP, every failure as one of our errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import aiohttp
+import msgspec
+
+from client.errors import NodeLost, RequestRefused
+from protocol.errors import RemoteWireError
+
+BODY_MAX_BYTES = 4 << 20
+TIMEOUT = aiohttp.ClientTimeout(total=30)
+
+
+async def ask(http: aiohttp.ClientSession, method: str, url: str) -> Any:
+    """The JSON a node answers with. Raises RequestRefused, NodeLost, RemoteWireError."""
+    try:
+        async with http.request(method, url, timeout=TIMEOUT) as response:
+            return _reply(response.status, await _bounded_body(response))
+    except (aiohttp.ClientError, OSError) as error:
+        raise NodeLost(f"lost {url}: {error or 'no answer in time'}; try again once the node is back") from error
+
+
+async def _bounded_body(response: aiohttp.ClientResponse) -> bytes:
+    body = bytearray()
+    async for chunk in response.content.iter_any():
+        body += chunk
+        if len(body) > BODY_MAX_BYTES:
+            raise RemoteWireError(f"{response.url} sends more than {BODY_MAX_BYTES} bytes")
+    return bytes(body)
+
+
+def _reply(status: int, body: bytes) -> Any:
+    try:
+        reply = msgspec.json.decode(body)
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise RemoteWireError(f"HTTP {status} without a JSON body: {error}") from None
+    if status >= 400:
+        said = reply if isinstance(reply, dict) else {}
+        raise RequestRefused(str(said.get("code", f"HTTP {status}")), str(said.get("message", "")))
+    return reply

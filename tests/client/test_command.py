@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from aiohttp import web
+
+from client import NodeLost, RequestRefused, command, discovery
+from client.discovery import NodeAddress
+from client.errors import ExportError
+from protocol import messages as m
+from protocol.errors import LocalWireError, ScannerFault
+from tests.client.scripted_node import Line, greet, serving_in_thread, show_and_answer, synthetic_grid
+
+GRID = synthetic_grid()
+NODE = NodeAddress("one", "127.0.0.1", 7345, "id-one", "ready", False)
+
+
+def run(*arguments: str) -> int:
+    """A subcommand as `foveascan` runs it."""
+    parser = argparse.ArgumentParser()
+    command.add_subcommands(parser.add_subparsers(required=True))
+    args = parser.parse_args(arguments)
+    status: int = args.run(args)
+    return status
+
+
+def json_lines(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+@pytest.fixture
+def nodes(monkeypatch: pytest.MonkeyPatch) -> list[NodeAddress]:
+    """What discovery finds."""
+    found: list[NodeAddress] = []
+
+    async def discover(timeout_s: float, name: str | None = None) -> list[NodeAddress]:
+        return [node for node in found if name in (None, node.name)]
+
+    monkeypatch.setattr(discovery, "discover", discover)
+    return found
+
+
+def test_discover_prints_every_node(nodes: list[NodeAddress], capsys: pytest.CaptureFixture[str]) -> None:
+    nodes.append(NODE)
+    assert run("discover") == 0
+    assert capsys.readouterr().out == "http://127.0.0.1:7345  one  ready\n"
+    assert run("discover", "--json") == 0
+    url = "http://127.0.0.1:7345"
+    assert json_lines(capsys.readouterr().out) == [
+        {"name": "one", "id": "id-one", "state": "ready", "url": url, "tls": False}
+    ]
+
+
+def test_discover_without_a_node_names_the_cure(nodes: list[NodeAddress]) -> None:
+    with pytest.raises(NodeLost, match="within 0.5 s; start one with `foveascan serve`"):
+        run("discover", "--timeout", "0.5")
+
+
+def test_look_prints_the_scan_and_each_update_and_writes_the_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving_in_thread(show_and_answer) as url:
+        target = tmp_path / "model.npz"
+        assert run("look", "--node", url, "--at", "0.4,0.4", "--json", "-o", str(target)) == 0
+    scan, update = json_lines(capsys.readouterr().out)
+    assert (scan["scan"], scan["range"], scan["texture"]) == ("synthetic", [64, 96], [128, 256])
+    assert scan["first_view_bytes"] > 0
+    assert (update["u"], update["v"], update["reason"], update["texture_db"]) == (0.4, 0.4, "complete", 100.0)
+    with np.load(target) as file:
+        assert np.array_equal(file["range_steps"][16:32, 24:48], GRID.range_steps[16:32, 24:48])
+
+
+def test_look_is_readable_without_json(capsys: pytest.CaptureFixture[str]) -> None:
+    with serving_in_thread(show_and_answer) as url:
+        run("look", "--node", url)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("scan synthetic: 96 x 64, first view ")
+    assert second.startswith("(0.5, 0.5): complete, ") and second.endswith("range within 0 mm, texture 100.0 dB")
+
+
+def test_look_finds_the_only_node(nodes: list[NodeAddress], capsys: pytest.CaptureFixture[str]) -> None:
+    with serving_in_thread(show_and_answer) as url:
+        nodes.append(NodeAddress("one", "127.0.0.1", int(url.rpartition(":")[2]), "", "ready", False))
+        assert run("look", "--json") == 0
+    assert len(json_lines(capsys.readouterr().out)) == 2
+
+
+def test_look_asks_which_of_several_nodes(nodes: list[NodeAddress]) -> None:
+    nodes += [NODE, NodeAddress("two", "127.0.0.2", 1, "", "ready", False)]
+    with pytest.raises(NodeLost, match="--node http://127.0.0.1:7345 or http://127.0.0.2:1"):
+        run("look")
+
+
+def test_look_refuses_a_format_it_cannot_write_before_it_connects() -> None:
+    with pytest.raises(ExportError, match=r"model\.xyz: cannot write \.xyz; use \.npz"):
+        run("look", "--node", "http://127.0.0.1:9", "-o", "model.xyz")
+
+
+def test_look_passes_a_refusal_on() -> None:
+    async def refuse(line: Line) -> None:
+        await greet(line)
+        asked = await line.hear()
+        assert isinstance(asked, m.Open) and asked.scan == "nope"
+        await line.say(m.Refused(asked.request, "not found", "no scan 'nope'"))
+        await line.gone()
+
+    with serving_in_thread(refuse) as url, pytest.raises(RequestRefused, match="no scan 'nope'"):
+        run("look", "--node", url, "--scan", "nope")
+
+
+def test_look_out_of_bounds_is_named() -> None:
+    with serving_in_thread(show_and_answer) as url, pytest.raises(LocalWireError, match="window"):
+        run("look", "--node", url, "--window", "2")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--at", "0.5"), ("--at", "1,0"), ("--at", "0,nan"), ("--at", "a,b"), ("--timeout", "0"), ("--max-wait", "inf")],
+)
+def test_arguments_without_sense_are_wrong_usage(
+    arguments: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        run("look", *arguments)
+    assert end.value.code == 2 and arguments[0] in capsys.readouterr().err
+
+
+class Turntable:
+    """A node's HTTP side while it sweeps. phases : what GET /v1/node says, one after the other, the last for ever."""
+
+    def __init__(self, *phases: dict[str, Any]) -> None:
+        self.phases = [{"progress": 0.0, "sweeps": 0, "why": "", **phase} for phase in phases]
+        self.swept = threading.Event()
+
+    def routes(self) -> tuple[web.RouteDef, ...]:
+        return web.get("/v1/node", self.node), web.post("/v1/sweeps", self.sweep)
+
+    async def node(self, request: web.Request) -> web.Response:
+        phase = self.phases.pop(0) if len(self.phases) > 1 else self.phases[0]
+        if phase["sweeps"]:
+            self.swept.set()
+        return web.json_response({"capture": phase})
+
+    async def sweep(self, request: web.Request) -> web.Response:
+        return web.json_response(self.phases[0], status=202)
+
+    async def announce(self, line: Line) -> None:
+        """The script of the stream."""
+        await greet(line)
+        await asyncio.to_thread(self.swept.wait, 10)
+        await line.say(m.Published("fresh"))
+        await line.gone()
+
+
+def test_scan_sweeps_once_and_prints_the_new_scan(capsys: pytest.CaptureFixture[str]) -> None:
+    sweeping = {"phase": "sweeping", "progress": 0.5}
+    table = Turntable({"phase": "connecting"}, {"phase": "ready"}, sweeping, {"phase": "ready", "sweeps": 1})
+    with serving_in_thread(table.announce, *table.routes()) as url:
+        assert run("scan", "--node", url, "--json") == 0
+    assert json_lines(capsys.readouterr().out) == [{"scan": "fresh"}]
+
+
+def test_a_sweep_that_fails_says_why() -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "ready", "why": "sweep interrupted: the port is gone"})
+    with serving_in_thread(greet_and_wait, *table.routes()) as url, pytest.raises(ScannerFault, match="port is gone"):
+        run("scan", "--node", url)
+
+
+def test_a_node_without_a_scanner_is_named() -> None:
+    table = Turntable({"phase": "no scanner"})
+    with serving_in_thread(greet_and_wait, *table.routes()) as url, pytest.raises(ScannerFault, match="--scanner"):
+        run("scan", "--node", url)
+
+
+async def greet_and_wait(line: Line) -> None:
+    await greet(line)
+    await line.gone()
