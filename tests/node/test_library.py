@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from node import library as library_module
+from node import durable
 from node.coarse import build_coarse, fill_voids
-from node.library import About, Library, content_id
+from node.durable import NoRoom
+from node.library import About, Library, content_id, survey, verify
+from node.library_folder import OWN
+from node.sidecar import Changes
 from protocol.errors import LibraryError
 from protocol.grid import Grid, GridSpec
 
@@ -22,6 +25,17 @@ def _grid(seed: int, spec: GridSpec = SPEC) -> Grid:
     range_steps = rng.integers(0, 3, (spec.height, spec.width)).astype(np.uint16)
     texture = rng.integers(0, 256, (spec.texture_height, spec.texture_width, 3)).astype(np.uint8)
     return Grid(spec, range_steps, texture)
+
+
+def _reopened(library: Library) -> Library:
+    """The library as the next start of the node finds it."""
+    library.close()
+    return Library(library.folder)
+
+
+def _entries(folder: Path) -> set[str]:
+    """What lies in a library beside its own things."""
+    return {path.name for path in folder.iterdir()} - OWN
 
 
 def _files(folder: Path) -> dict[str, bytes]:
@@ -70,9 +84,9 @@ def test_the_id_tells_any_change_of_samples_or_geometry() -> None:
 def test_scans_are_listed_newest_first_whatever_the_clock_said(tmp_path: Path) -> None:
     library = Library(tmp_path)
     ids = [library.add(_grid(seed), About(1e9 - 1000 * seed)).id for seed in range(3)]
-    library = Library(tmp_path)
+    library = _reopened(library)
     ids.append(library.add(_grid(3), About(0.0)).id)
-    for current in (library, Library(tmp_path)):
+    for current in (library, _reopened(library)):
         assert [summary.id for summary in current.scans()] == ids[::-1]
         assert [summary.sequence for summary in current.scans()] == [4, 3, 2, 1]
 
@@ -84,11 +98,11 @@ def test_the_same_content_again_is_the_same_scan_and_the_newest(tmp_path: Path) 
     again = library.add(_grid(0), About(2e9, name="again"))
     assert again.id == first.id
     assert again.range_steps is first.range_steps
-    for current in (library, Library(tmp_path)):
+    for current in (library, _reopened(library)):
         assert [summary.about.name for summary in current.scans()] == ["again", "head"]
         assert current.open(first.id).about == About(2e9, name="again")
         assert current.problems == ()
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(_entries(tmp_path)) == 2
 
 
 def test_listing_reads_no_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,10 +114,10 @@ def test_listing_reads_no_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         opened.append(Path(path).name)
         return really_open(path, mode)
 
-    monkeypatch.setattr(library_module, "open", noted_open, raising=False)
+    monkeypatch.setattr(durable, "open", noted_open, raising=False)
     monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("samples were read"))
     assert len(Library(tmp_path).scans()) == 1
-    assert opened == ["scan.json"]
+    assert set(opened) == {"library.json", "scan.json", "sidecar.json"}
 
 
 @pytest.mark.parametrize("scan_id", ["", "0" * 32, "../library", "x" * 10_000, "\0"])
@@ -175,7 +189,7 @@ def test_a_damaged_folder_is_reported_left_alone_and_disturbs_nothing(
     sound, hurt = library.add(_grid(0), ABOUT), library.add(_grid(1), ABOUT)
     damage(tmp_path / hurt.id)
     before = _files(tmp_path)
-    library = Library(tmp_path)
+    library = _reopened(library)
     assert [summary.id for summary in library.scans()] == [sound.id]
     assert [reason in problem.reason for problem in library.problems] == [True]
     with pytest.raises(LibraryError, match="no scan"):
@@ -194,7 +208,7 @@ def test_a_rotten_byte_is_found_when_the_scan_is_opened(tmp_path: Path, file: st
     data = bytearray(path.read_bytes())
     data[offset] ^= 1
     path.write_bytes(data)
-    library = Library(tmp_path)
+    library = _reopened(library)
     with pytest.raises(LibraryError, match="is damaged"):
         library.open(scan_id)
     assert [problem.name for problem in library.problems] == [scan_id]
@@ -202,18 +216,40 @@ def test_a_rotten_byte_is_found_when_the_scan_is_opened(tmp_path: Path, file: st
     with pytest.raises(LibraryError, match="cannot keep scan"):
         library.add(_grid(0), ABOUT)
     assert path.read_bytes() == data
-    assert len(list(tmp_path.iterdir())) == 1
+    assert len(_entries(tmp_path)) == 1
 
 
-def test_foreign_things_and_unfinished_scans_are_reported(tmp_path: Path) -> None:
+def test_foreign_things_are_reported_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "holiday").mkdir()
-    (tmp_path / ".incoming-x1").mkdir()
     (tmp_path / ("a" * 32)).write_text("a file with the name of a scan")
-    reasons = {problem.name: problem.reason for problem in Library(tmp_path).problems}
+    (tmp_path / ".incoming-x1").mkdir()
+    (tmp_path / ".incoming-x1" / "letter.txt").write_text("mine")
+    library = Library(tmp_path)
+    reasons = {problem.name: problem.reason for problem in library.problems}
     assert set(reasons) == {"notes.txt", "holiday", ".incoming-x1", "a" * 32}
-    assert "never completely written" in reasons.pop(".incoming-x1")
+    assert "unfinished" in reasons.pop(".incoming-x1")
     assert set(reasons.values()) == {"not a scan"}
+    assert library.found == []
+    assert (tmp_path / ".incoming-x1" / "letter.txt").read_text() == "mine"
+
+
+def test_what_a_crash_left_is_cleared_away_and_told(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    scan_id = library.add(_grid(0), ABOUT).id
+    gone_id = library.add(_grid(1), ABOUT).id
+    (tmp_path / ".incoming-x1").mkdir()
+    (tmp_path / ".incoming-x1" / "range.npy").write_bytes(b"half of it")
+    (tmp_path / gone_id).rename(tmp_path / f".trash-{gone_id}-12345678")
+    (tmp_path / scan_id / "sidecar.json.new").write_text("half of it")
+    library = _reopened(library)
+    removed, finished = library.found
+    assert "never completely written" in removed
+    assert finished == f"finished deleting scan {gone_id}"
+    assert [summary.id for summary in library.scans()] == [scan_id]
+    assert library.problems == ()
+    assert _entries(tmp_path) == {scan_id}
+    assert {path.name for path in (tmp_path / scan_id).iterdir()} == {"range.npy", "texture.npy", "scan.json"}
 
 
 def test_a_scan_that_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,11 +261,96 @@ def test_a_scan_that_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatc
     for name in ("fsync", "rename"):
         with monkeypatch.context() as patch:
             patch.setattr(os, name, full_disk)
-            with pytest.raises(LibraryError, match="No space left on device"):
+            with pytest.raises(NoRoom, match="No space left on device"):
                 library.add(_grid(0), ABOUT)
-        assert list(tmp_path.iterdir()) == []
+        assert _entries(tmp_path) == set()
         assert library.scans() == []
     assert library.add(_grid(0), ABOUT).id == library.scans()[0].id
+
+
+def test_a_library_is_one_process_s_at_a_time(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    with pytest.raises(LibraryError, match=f"in use by process {os.getpid()}"):
+        Library(tmp_path)
+    assert _reopened(library).scans() == []
+
+
+def test_a_library_of_a_newer_version_is_refused_untouched(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    library.add(_grid(0), ABOUT)
+    library.close()
+    (tmp_path / "library.json").write_text('{"format": 2, "surprise": true}')
+    (tmp_path / ".incoming-x1").mkdir()
+    before = _files(tmp_path)
+    for look in (Library, survey):
+        with pytest.raises(LibraryError, match="has format 2"):
+            look(tmp_path)
+    assert _files(tmp_path) == before
+    assert (tmp_path / ".incoming-x1").exists()
+
+
+@pytest.mark.parametrize("mark", [b"", b"{}", b'{"format": "x"}', b" " * 5000, b"\xff"])
+def test_a_library_with_a_damaged_mark_is_refused(tmp_path: Path, mark: bytes) -> None:
+    (tmp_path / "library.json").write_bytes(mark)
+    with pytest.raises(LibraryError):
+        Library(tmp_path)
+    assert _files(tmp_path) == {"library.json": mark}
+
+
+def test_a_deleted_scan_is_gone_for_all_but_those_who_look_at_it(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    grid = _grid(0)
+    scan, other = library.add(grid, ABOUT), library.add(_grid(1), ABOUT)
+    library.delete(scan.id)
+    assert np.array_equal(scan.texture, grid.texture)
+    for current in (library, _reopened(library)):
+        assert [summary.id for summary in current.scans()] == [other.id]
+        with pytest.raises(LibraryError, match="no scan"):
+            current.open(scan.id)
+        with pytest.raises(LibraryError, match="no scan"):
+            current.delete(scan.id)
+    assert _entries(tmp_path) == {other.id}
+
+
+def test_a_renamed_scan_is_listed_under_its_new_name(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    scan_id = library.add(_grid(0), ABOUT).id
+    library.rename(scan_id, "left knee", "ana")
+    library.annotate(scan_id, Changes(subject="P-17"), "ben")
+    for current in (library, _reopened(library)):
+        assert [summary.about.name for summary in current.scans()] == ["left knee"]
+        assert current.open(scan_id).id == scan_id
+        sidecar = current.sidecar(scan_id)
+        assert (sidecar.subject, [change.by for change in sidecar.history]) == ("P-17", ["ana", "ben"])
+
+
+def test_a_scan_with_a_damaged_sidecar_stays_and_the_sidecar_is_left_alone(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    scan_id = library.add(_grid(0), ABOUT).id
+    library.rename(scan_id, "left knee", "ana")
+    path = tmp_path / scan_id / "sidecar.json"
+    path.write_bytes(path.read_bytes().replace(b"left knee", b"left knew"))
+    before = path.read_bytes()
+    library = _reopened(library)
+    assert [problem.name for problem in library.problems] == [f"{scan_id}/sidecar.json"]
+    assert library.open(scan_id).about.name == "head"
+    with pytest.raises(LibraryError, match="damaged"):
+        library.sidecar(scan_id)
+    with pytest.raises(LibraryError, match="damaged"):
+        library.rename(scan_id, "x", "ana")
+    assert path.read_bytes() == before
+
+
+def test_verify_reads_every_sample_and_needs_no_lock(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    sound, rotten = library.add(_grid(0), ABOUT).id, library.add(_grid(1), ABOUT).id
+    path = tmp_path / rotten / "texture.npy"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    for found in (dict(library.verify()), dict(verify(tmp_path, list(survey(tmp_path)[0])))):
+        assert found[sound] is None
+        assert "not what they were" in str(found[rotten])
 
 
 def test_a_library_that_is_a_file_is_refused(tmp_path: Path) -> None:

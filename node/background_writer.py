@@ -1,0 +1,113 @@
+"""Bytes to a file's end by a thread of its own, so that a slow disk never holds up the port they come from."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+SYNC_S = 0.25  # what was written is made durable at least that often
+WAITING_BYTES_MAX = 8 << 20
+
+
+class BackgroundWriter:
+    """Appends to an existing file. Use it from one thread; errors of the disk surface in the next call.
+
+    Where the disk is slower than the source, `write` waits, so the source is slowed and nothing is dropped.
+    A piece that does not fit on the disk is taken away again whole.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND)
+        self._changed = threading.Condition()
+        self._waiting: deque[bytes] = deque()
+        self._waiting_bytes = 0
+        self._busy = False
+        self._unsafe = False
+        self._hurry = False  # somebody waits until all is durable
+        self._closing = False
+        self._failure: OSError | None = None
+        self._synced_s = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._thread.start()
+
+    def write(self, piece: bytes) -> None:
+        """Take a piece. Raises OSError when an earlier one could not be written."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._failure or self._waiting_bytes < WAITING_BYTES_MAX)
+            self._raise_failure()
+            self._waiting.append(piece)
+            self._waiting_bytes += len(piece)
+            self._changed.notify_all()
+
+    def sync(self) -> None:
+        """Wait until everything taken is durable. Raises OSError."""
+        with self._changed:
+            self._hurry = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._failure or not (self._waiting or self._busy or self._unsafe))
+            self._hurry = False
+            self._raise_failure()
+
+    def close(self) -> None:
+        """Write what is left and let go of the file. Raises OSError once it is let go of."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+        os.close(self._file)
+        self._raise_failure()
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _run(self) -> None:
+        try:
+            while (batch := self._next_batch()) is not None:
+                for piece in batch:
+                    _append(self._file, piece)
+                self._done(wrote=bool(batch))
+        except OSError as error:
+            with self._changed:
+                self._failure = error
+                self._waiting.clear()
+                self._changed.notify_all()
+
+    def _next_batch(self) -> list[bytes] | None:
+        """Everything that waits; [] when it is only time to sync; None at the end."""
+        with self._changed:
+            due_s = max(0.0, self._synced_s + SYNC_S - time.monotonic()) if self._unsafe else None
+            self._changed.wait_for(lambda: self._waiting or self._closing or (self._hurry and self._unsafe), due_s)
+            if self._closing and not self._waiting and not self._unsafe:
+                return None
+            batch = list(self._waiting)
+            self._waiting.clear()
+            self._waiting_bytes = 0
+            self._busy = True
+            self._changed.notify_all()
+            return batch
+
+    def _done(self, wrote: bool) -> None:
+        """A batch is written: make it durable when that is due."""
+        self._unsafe |= wrote
+        now_s = time.monotonic()
+        if self._unsafe and (self._hurry or self._closing or now_s >= self._synced_s + SYNC_S):
+            os.fdatasync(self._file)
+            self._unsafe, self._synced_s = False, now_s
+        with self._changed:
+            self._busy = False
+            self._changed.notify_all()
+
+
+def _append(file: int, piece: bytes) -> None:
+    """Write a piece whole, or take away what of it was written and raise OSError."""
+    begin, rest = os.fstat(file).st_size, memoryview(piece)
+    try:
+        while rest:
+            rest = rest[os.write(file, rest) :]
+    except OSError:
+        os.ftruncate(file, begin)
+        raise

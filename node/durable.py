@@ -1,0 +1,68 @@
+"""Files that survive a power cut: written whole beside their place, made durable, then moved there in one step."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from protocol.errors import LibraryError
+
+NEW = ".new"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class NoRoom(LibraryError):
+    """The disk has no room for what was to be kept."""
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Make `data` the content of a file, or leave the file as it was. Raises OSError."""
+    new = path.with_name(path.name + NEW)
+    try:
+        with open(new, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(new, path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def read_bounded(path: Path, bytes_max: int) -> bytes:
+    """The content of a small file. Raises OSError, or LibraryError when it is larger than `bytes_max`."""
+    with open(path, "rb") as file:
+        data = file.read(bytes_max + 1)
+    if len(data) > bytes_max:
+        raise LibraryError(f"its {path.name} is larger than {bytes_max} bytes")
+    return data
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def free_bytes(folder: Path) -> int:
+    """What an ordinary user may still write beside a folder. [bytes]"""
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize
+
+
+def require_room(folder: Path, needed_bytes: int, what: str) -> None:
+    """Raises NoRoom, naming the bytes, unless the disk of a folder has room for `needed_bytes`."""
+    free = free_bytes(folder)
+    if free < needed_bytes:
+        raise NoRoom(f"the disk is full: {what} needs {needed_bytes} bytes and {free} are free; delete or move scans")
+
+
+def disk_error(doing: str, error: OSError) -> LibraryError:
+    """What failed on the disk, as an error of the library."""
+    kind = NoRoom if error.errno in _FULL else LibraryError
+    return kind(f"{doing}: {error.strerror or error}")

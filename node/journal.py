@@ -1,0 +1,367 @@
+"""Sweeps on disk as they come in, so that what a scanner sent is never lost, whatever ends the sweep.
+
+    <library>/sweeps/<id>.sweep     one file per sweep, only ever appended to, removed once its scan is kept
+
+A journal is a row of records: magic, length, checksum, and as payload some messages, each behind its type and length.
+The messages are those of the scanner link, byte for byte; the first record has BEGIN (our own: format and time),
+HELLO_ACK and SWEEP_HEADER, the others have columns, the last one may have ERROR with the reason of an early end.
+A record stands for itself: a torn tail costs that record, a rotten stretch in the middle costs what lies in it.
+A sweep is complete when it has every piece of every column that its header promises, whoever asks and whenever.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+import secrets
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.ledger import Ledger
+from node.background_writer import BackgroundWriter
+from node.durable import NEW, disk_error, require_room, sync_folder, write_whole
+from node.scan_folder import Problem
+from protocol.errors import LibraryError, RemoteWireError
+from protocol.scanner_messages import (
+    COLUMN_OVERHEAD,
+    Channel,
+    Column,
+    DeviceInfo,
+    Fault,
+    Message,
+    RangeColumn,
+    SweepHeader,
+    TextureColumn,
+    decode_message,
+    is_known,
+)
+
+FORMAT = 1
+SUFFIX = ".sweep"
+RECORD_BYTES = 65536  # a record is written once its messages reach this
+PAYLOAD_BYTES_MAX = 2 * 65536
+SPARE_BYTES = 16 << 20  # what a sweep must leave free: sidecars, logs, other programs
+CUT_SHORT = "the node was cut off in the middle of it"
+
+_MAGIC = b"FSj\x01"
+_RECORD = struct.Struct("<4sII")  # magic, length of the payload, CRC-32 of length and payload
+_MESSAGE = struct.Struct("<BH")  # type, length
+_BEGIN_TYPE = 0x00  # no message of the link
+_BEGIN = struct.Struct("<Hd")  # format, start by the node's clock
+_ID = re.compile("[0-9a-f]{16}")
+
+
+@dataclass(frozen=True, slots=True)
+class Interrupted:
+    """A sweep that has not become a scan.
+
+    started_unix_s : by the node's clock.  info : the scanner that made it, and its boot id.  why : what ended it.
+    held, expected : pieces of columns on disk, and those a complete sweep has.  damaged_bytes : rotten ones set aside.
+    """
+
+    id: str
+    started_unix_s: float
+    info: DeviceInfo
+    header: SweepHeader
+    held: int
+    expected: int
+    size_bytes: int
+    damaged_bytes: int
+    why: str
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every column is there, so that a scan can be made without the scanner."""
+        return self.held == self.expected
+
+
+class Journal:
+    """The journal of a running sweep. For one thread; errors of the disk surface as LibraryError in any call."""
+
+    def __init__(self, path: Path) -> None:
+        self.id = path.stem
+        self._writer = BackgroundWriter(path)
+        self._messages: list[bytes] = []
+        self._size = 0
+
+    def add(self, column: Column) -> None:
+        """Take a column."""
+        self._take(column)
+        if self._size >= RECORD_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Send what was taken on its way to the disk; call it now and then, it bounds what a crash costs."""
+        if not self._messages:
+            return
+        record = encode_record(b"".join(self._messages))
+        self._messages.clear()
+        self._size = 0
+        try:
+            self._writer.write(record)
+        except OSError as error:
+            raise disk_error("cannot keep the sweep", error) from error
+
+    def close(self, why: str | None = None) -> None:
+        """Make everything durable and let go of the file. why : what ended the sweep, unless it ended well."""
+        if why is not None:
+            self._take(Fault(0, why.encode()[:150].decode(errors="ignore")))
+        failure: LibraryError | None = None
+        try:
+            self.flush()
+        except LibraryError as error:
+            failure = error
+        try:
+            self._writer.close()
+        except OSError as error:
+            failure = disk_error("cannot keep the sweep", error)
+        if failure is not None:
+            raise failure
+
+    def _take(self, message: Message) -> None:
+        entry = encode_entry(message)
+        self._messages.append(entry)
+        self._size += len(entry)
+
+
+class Journals:
+    """The journals in one folder, which is made if it is missing. Nobody else may use the folder meanwhile.
+
+    found : what was made good at the start.  problems : what lies in the folder and is no journal; it is left alone.
+    Safe to use from several threads.  Raises LibraryError when the folder cannot be used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.found: list[str] = []
+        self.problems: list[Problem] = []
+        self._sweeps: dict[str, Interrupted] = {}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name in sorted(os.listdir(folder)):
+                self._meet(folder / name)
+        except OSError as error:
+            raise disk_error(f"the folder {folder} cannot be used", error) from error
+
+    def interrupted(self) -> list[Interrupted]:
+        """Every sweep that ended and did not become a scan, oldest first. One that runs is not among them."""
+        return sorted(list(self._sweeps.values()), key=lambda sweep: (sweep.started_unix_s, sweep.id))
+
+    def get(self, sweep_id: str) -> Interrupted:
+        """One of them. Raises LibraryError when there is none such."""
+        try:
+            return self._sweeps[sweep_id]
+        except KeyError:
+            raise LibraryError(f"no interrupted sweep {sweep_id[:40]!r}") from None
+
+    def begin(self, info: DeviceInfo, header: SweepHeader, started_unix_s: float) -> Journal:
+        """Open the journal of a new sweep. Raises NoRoom, before anything is written, when it would not fit."""
+        require_room(self._folder, needed_bytes(header) + SPARE_BYTES, "this sweep")
+        path = self._path(secrets.token_hex(8))
+        try:
+            write_whole(path, encode_opening(info, header, started_unix_s))
+            return Journal(path)
+        except OSError as error:
+            raise disk_error("cannot keep the sweep", error) from error
+
+    def reopen(self, sweep_id: str) -> Journal:
+        """Go on with an interrupted one. Raises LibraryError, NoRoom."""
+        sweep = self.get(sweep_id)
+        require_room(self._folder, needed_bytes(sweep.header) - sweep.size_bytes + SPARE_BYTES, "going on")
+        try:
+            journal = Journal(self._path(sweep_id))
+        except OSError as error:
+            raise disk_error("cannot go on with the sweep", error) from error
+        del self._sweeps[sweep_id]
+        return journal
+
+    def keep(self, journal: Journal, why: str) -> Interrupted:
+        """Close the journal of a sweep that ended early: it is listed from now on, with all that was kept of it."""
+        with suppress(LibraryError):  # whoever adds columns heard of a failing disk; here it is kept what fits
+            journal.close(why)
+        return self._survey(self._path(journal.id))
+
+    def columns(self, sweep_id: str) -> Iterator[Column]:
+        """The columns of an interrupted sweep, each piece once; their samples lie in the file. Raises LibraryError."""
+        ledger = Ledger(self.get(sweep_id).header)
+        for _, payload in read_records(_map(self._path(sweep_id))):
+            yield from (column for column in _columns_in(payload) if ledger.take(column))
+
+    def remove(self, sweep_id: str) -> None:
+        """Delete a journal, because its scan is kept or because nobody wants it. Raises LibraryError."""
+        try:
+            self._path(sweep_id).unlink()
+            sync_folder(self._folder)
+        except OSError as error:
+            raise disk_error(f"cannot delete sweep {sweep_id[:40]!r}", error) from error
+        self._sweeps.pop(sweep_id, None)
+
+    def _path(self, sweep_id: str) -> Path:
+        if not _ID.fullmatch(sweep_id):
+            raise LibraryError(f"no interrupted sweep {sweep_id[:40]!r}")
+        return self._folder / (sweep_id + SUFFIX)
+
+    def _meet(self, path: Path) -> None:
+        """Something that lay here at the start."""
+        if path.name.endswith(SUFFIX + NEW) and _ID.fullmatch(path.name.removesuffix(SUFFIX + NEW)):
+            path.unlink()  # a sweep that had not begun
+            return
+        if path.suffix != SUFFIX or not _ID.fullmatch(path.stem) or not path.is_file():
+            self.problems.append(Problem(f"{self._folder.name}/{path.name}", "not a journal of a sweep"))
+            return
+        try:
+            sweep = self._survey(path)
+        except LibraryError as error:
+            self.problems.append(Problem(f"{self._folder.name}/{path.name}", str(error)))
+            return
+        kind = "complete sweep that was not published yet" if sweep.is_complete else "interrupted sweep"
+        self.found.append(f"{kind} {sweep.id}: {sweep.held} of {sweep.expected} pieces of columns; {sweep.why}")
+
+    def _survey(self, path: Path) -> Interrupted:
+        """Read a journal through, cut its torn tail, and list it. Raises LibraryError when it is none."""
+        size_bytes = path.stat().st_size
+        sweep = survey_journal(path.stem, _map(path))
+        if sweep.size_bytes < size_bytes:
+            self.found.append(f"sweep {sweep.id}: its last {size_bytes - sweep.size_bytes} bytes were torn and are cut")
+            with open(path, "r+b") as file:
+                file.truncate(sweep.size_bytes)
+                os.fsync(file.fileno())
+        self._sweeps[sweep.id] = sweep
+        return sweep
+
+
+def needed_bytes(header: SweepHeader) -> int:
+    """What a sweep takes on disk until it is published: its journal and its scan. [bytes]"""
+    spec = header.spec
+    total = 2 * spec.height * spec.width + 3 * spec.texture_height * spec.texture_width + RECORD_BYTES
+    for channel, sample_bytes in ((Channel.RANGE, 2), (Channel.TEXTURE, 3)):
+        if channel in header.channels:
+            columns, rows, piece_rows = header.shape(channel)
+            column_bytes = rows * sample_bytes + -(-rows // piece_rows) * (_MESSAGE.size + COLUMN_OVERHEAD)
+            total += header.passes * columns * column_bytes
+    return total
+
+
+def encode_opening(info: DeviceInfo, header: SweepHeader, started_unix_s: float) -> bytes:
+    """The first record of a journal."""
+    begin = _BEGIN.pack(FORMAT, started_unix_s)
+    return encode_record(
+        _MESSAGE.pack(_BEGIN_TYPE, len(begin)) + begin + encode_entry(info) + encode_entry(header)
+    )
+
+
+def encode_entry(message: Message) -> bytes:
+    """A message of the link as it stands in a record."""
+    data = message.to_bytes()
+    return _MESSAGE.pack(message.TYPE, len(data)) + data
+
+
+def encode_record(payload: bytes) -> bytes:
+    """A record; read_records is the inverse."""
+    return _RECORD.pack(_MAGIC, len(payload), _checksum(payload)) + payload
+
+
+def read_records(data: bytes | mmap.mmap) -> Iterator[tuple[int, memoryview]]:
+    """(place behind it, payload) of every whole record; what lies between them is passed over."""
+    at = 0
+    while at >= 0:
+        payload = _record_at(data, at)
+        if payload is None:
+            at = data.find(_MAGIC, at + 1)
+        else:
+            at += _RECORD.size + len(payload)
+            yield at, payload
+
+
+def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
+    """What a journal holds; size_bytes ends with its last whole record. Raises LibraryError when it is none."""
+    records = read_records(data)
+    end, opening = next(records, (0, memoryview(b"")))
+    if end != _RECORD.size + len(opening) or not opening:
+        raise LibraryError("its beginning is damaged")
+    started_unix_s, info, header = _decode_opening(opening)
+    ledger, read_bytes, why = Ledger(header), end, CUT_SHORT
+    for place, payload in records:
+        end, read_bytes = place, read_bytes + _RECORD.size + len(payload)
+        for message in _messages_in(payload):
+            if isinstance(message, Fault):
+                why = message.text
+            elif isinstance(message, RangeColumn | TextureColumn):
+                ledger.take(message)
+    return Interrupted(
+        sweep_id, started_unix_s, info, header, ledger.held, ledger.expected, end, end - read_bytes, why
+    )
+
+
+def _record_at(data: bytes | mmap.mmap, at: int) -> memoryview | None:
+    """The payload of the record that begins here, if a whole one does."""
+    if len(data) - at < _RECORD.size:
+        return None
+    magic, size, checksum = _RECORD.unpack_from(data, at)
+    begin = at + _RECORD.size
+    if magic != _MAGIC or size > min(PAYLOAD_BYTES_MAX, len(data) - begin):
+        return None
+    payload = memoryview(data)[begin : begin + size]
+    return payload if _checksum(payload) == checksum else None
+
+
+def _checksum(payload: bytes | memoryview) -> int:
+    return zlib.crc32(payload, len(payload))
+
+
+def _entries(payload: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """(type, bytes) of every message in a record. Raises LibraryError."""
+    at = 0
+    while at < len(payload):
+        begin = at + _MESSAGE.size
+        kind, size = _MESSAGE.unpack_from(payload, at) if begin <= len(payload) else (0, len(payload))
+        at = begin + size
+        if at > len(payload):
+            raise LibraryError("a record ends in the middle of a message")
+        yield kind, payload[begin:at]
+
+
+def _messages_in(payload: memoryview) -> Iterator[Message]:
+    """The messages of a record. Raises LibraryError."""
+    for kind, data in _entries(payload):
+        if not is_known(kind):
+            raise LibraryError(f"it holds a message of type {kind:#04x}, which this version does not know")
+        try:
+            yield decode_message(kind, data)
+        except RemoteWireError as error:
+            raise LibraryError(f"it holds a message that makes no sense: {error}") from error
+
+
+def _columns_in(payload: memoryview) -> Iterator[Column]:
+    """The columns of a record behind the first; that has none, and BEGIN, which is no message of the link."""
+    if payload[:1] != bytes([_BEGIN_TYPE]):
+        yield from (m for m in _messages_in(payload) if isinstance(m, RangeColumn | TextureColumn))
+
+
+def _decode_opening(payload: memoryview) -> tuple[float, DeviceInfo, SweepHeader]:
+    (kind, begin), *_ = _entries(payload)
+    if kind != _BEGIN_TYPE or len(begin) < _BEGIN.size:
+        raise LibraryError("its beginning is damaged")
+    format, started_unix_s = _BEGIN.unpack_from(begin)
+    if format != FORMAT:
+        raise LibraryError("written in a format that this version does not know")
+    match list(_messages_in(payload[_MESSAGE.size + len(begin) :])):
+        case [DeviceInfo() as info, SweepHeader() as header]:
+            return started_unix_s, info, header
+    raise LibraryError("its beginning is damaged")
+
+
+def _map(path: Path) -> bytes | mmap.mmap:
+    """A file's bytes; they stay readable for as long as somebody holds them. Raises LibraryError."""
+    try:
+        with open(path, "rb") as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                return b""
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise disk_error("it cannot be read", error) from error

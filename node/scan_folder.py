@@ -1,0 +1,172 @@
+"""One scan on disk: a folder whose files are written once and never changed, except for the sidecar.
+
+    <library>/<scan id>/range.npy      (H, W) uint16 steps, little-endian, 0 = void
+                        texture.npy    (Ht, Wt, 3) uint8 RGB
+                        scan.json      format, id, sequence, geometry, where it came from
+                        sidecar.json   what people say of it (node.sidecar); missing until somebody does
+
+The id is the hash of geometry and samples, so it also tells whether a file has rotted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from node.durable import read_bounded, sync_folder, write_whole
+from protocol.errors import LibraryError
+from protocol.grid import Grid, GridSpec, ImageArray, StepArray
+
+FORMAT = 1
+RECORD_BYTES_MAX = 65536
+ARRAY_HEADER_BYTES_MAX = 4096
+TEXT_MAX = 200
+SCAN_ID = re.compile("[0-9a-f]{32}")
+INCOMING = ".incoming-"
+RANGE_FILE, TEXTURE_FILE, RECORD_FILE = "range.npy", "texture.npy", "scan.json"
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """Where a scan came from. Nothing of the patient: this is listed freely.
+
+    created_unix_s : the node's clock, for people; it orders nothing.  source : "sweep", "import", ...
+    name : what to call it, at most 200 characters.  Raises ValueError when out of bounds.
+    """
+
+    created_unix_s: float
+    source: str = "sweep"
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.created_unix_s):
+            raise ValueError(f"created_unix_s must be finite, got {self.created_unix_s}")
+        for text in (self.source, self.name):
+            if len(text) > TEXT_MAX:
+                raise ValueError(f"a text of {len(text)} characters, at most {TEXT_MAX} are kept")
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something in the library's folder that is not as it should be: its name there, and what is wrong."""
+
+    name: str
+    reason: str
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """scan.json. sequence : grows with every scan of a library, and orders them."""
+
+    format: int
+    id: str
+    sequence: int
+    spec: GridSpec
+    about: About
+
+
+class _Version(msgspec.Struct, frozen=True):
+    """The one field of scan.json that every version has."""
+
+    format: int
+
+
+def content_id(grid: Grid) -> str:
+    """Name of a grid: 32 hexadecimal digits, the first half of SHA-256 over its geometry and samples."""
+    digest = hashlib.sha256(b"foveascan scan 1\n")
+    digest.update(msgspec.json.encode(grid.spec))
+    digest.update(np.ascontiguousarray(grid.range_steps, "<u2").data)
+    digest.update(np.ascontiguousarray(grid.texture).data)
+    return digest.hexdigest()[:32]
+
+
+def read_record(folder: Path) -> Record:
+    """A scan's record, checked against the sizes of its files: reads no samples. Raises LibraryError."""
+    if not SCAN_ID.fullmatch(folder.name) or not folder.is_dir():
+        raise LibraryError("not a scan")
+    try:
+        record = decode_record(read_bounded(folder / RECORD_FILE, RECORD_BYTES_MAX))
+    except OSError as error:
+        raise LibraryError(f"its {RECORD_FILE} cannot be read: {error.strerror}") from error
+    if record.id != folder.name:
+        raise LibraryError(f"its {RECORD_FILE} belongs to scan {record.id[:40]!r}")
+    _check_sizes(folder, record.spec)
+    return record
+
+
+def decode_record(data: bytes) -> Record:
+    """The content of scan.json. Raises LibraryError."""
+    try:
+        if msgspec.json.decode(data, type=_Version).format != FORMAT:
+            raise LibraryError("written in a format that this version does not know")
+        return msgspec.json.decode(data, type=Record)
+    except msgspec.DecodeError as error:
+        raise LibraryError(f"its {RECORD_FILE} is damaged: {error}") from error
+
+
+def read_grid(folder: Path, spec: GridSpec) -> Grid:
+    """A scan's samples, mapped read-only. Raises LibraryError when they are not what its geometry says."""
+    try:
+        range_steps = np.load(folder / RANGE_FILE, mmap_mode="r", allow_pickle=False)
+        texture = np.load(folder / TEXTURE_FILE, mmap_mode="r", allow_pickle=False)
+        return Grid(spec, range_steps, texture)
+    except (OSError, ValueError, EOFError) as error:
+        raise LibraryError(f"its samples cannot be read: {error}") from error
+
+
+def read_sound_grid(folder: Path, spec: GridSpec) -> Grid:
+    """A scan's samples, mapped, and the same as when they were kept. Raises LibraryError."""
+    grid = read_grid(folder, spec)
+    if content_id(grid) != folder.name:
+        raise LibraryError("its samples are not what they were when it was kept")
+    return grid
+
+
+def write_scan(library: Path, record: Record, grid: Grid) -> None:
+    """Write a scan beside the others under a name that is no scan's, then rename it: it appears whole.
+
+    Raises OSError; then nothing of it is left.
+    """
+    incoming = Path(tempfile.mkdtemp(prefix=INCOMING, dir=library))
+    try:
+        _write_array(incoming / RANGE_FILE, np.ascontiguousarray(grid.range_steps, "<u2"))
+        _write_array(incoming / TEXTURE_FILE, np.ascontiguousarray(grid.texture))
+        write_record(incoming, record)
+        os.rename(incoming, library / record.id)
+        sync_folder(library)
+    except BaseException:
+        shutil.rmtree(incoming, ignore_errors=True)
+        raise
+
+
+def write_record(folder: Path, record: Record) -> None:
+    """Put scan.json into a folder, or exchange the one that is there, in one step. Raises OSError."""
+    write_whole(folder / RECORD_FILE, msgspec.json.format(msgspec.json.encode(record)))
+
+
+def _check_sizes(folder: Path, spec: GridSpec) -> None:
+    """A listing must not read samples: the sizes of their files show what was cut or lost."""
+    range_bytes = 2 * spec.height * spec.width
+    texture_bytes = 3 * spec.texture_height * spec.texture_width
+    for name, size_bytes in ((RANGE_FILE, range_bytes), (TEXTURE_FILE, texture_bytes)):
+        try:
+            header_bytes = os.stat(folder / name).st_size - size_bytes
+        except OSError as error:
+            raise LibraryError(f"its {name} cannot be read: {error.strerror}") from error
+        if not 0 < header_bytes <= ARRAY_HEADER_BYTES_MAX:
+            raise LibraryError(f"its {name} has the wrong size")
+
+
+def _write_array(path: Path, array: StepArray | ImageArray) -> None:
+    with open(path, "xb") as file:
+        np.save(file, array, allow_pickle=False)
+        file.flush()
+        os.fsync(file.fileno())
