@@ -29,6 +29,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from tempfile import TemporaryDirectory
@@ -43,6 +44,7 @@ __version__ = "0.1.0"
 
 PROGRAM = (sys.executable, "-P", "-m", "foveascan")  # -P: a folder called node or client where one stands is not ours
 READY_LINE_MAX_BYTES = 65536
+DEMO_CLICKS = 3
 END_S = 5.0  # what a program may take to end after SIGTERM
 
 FAILED = 1
@@ -111,24 +113,74 @@ def add_own_subcommands(subparsers: argparse._SubParsersAction[argparse.Argument
     demo.add_argument("--texture", metavar="IMAGE", help="texture of a specimen read from a .npz grid")
     demo.add_argument("--size", choices=("S", "M", "L"), default="S", help="size class of the scan (S)")
     demo.add_argument("--link-rate", metavar="BYTES_S", help="bytes a second over the link, instead of its baud rate")
+    demo.add_argument("--once", action="store_true", help="look at three places, compare with the truth, and end")
+    demo.add_argument("--json", action="store_true", help="with --once: print one JSON object")
     demo.set_defaults(run=run_demo)
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Simulated scanner and node as processes of their own, one sweep, then serve until a signal."""
+    """Simulated scanner and node as processes of their own, one sweep, then serve until a signal, or look and end."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that both programs are ended with the blocks below
     with TemporaryDirectory(prefix="foveascan-demo-") as folder:
-        with started(*_simulate(args, f"{folder}/scanner")) as (_, scanner):
+        with started(*_simulate(args, f"{folder}/scanner", f"{folder}/truth.npz")) as (_, scanner):
             with started(*_serve(scanner["path"], f"{folder}/library")) as (node, ready):
-                swept = subprocess.run([*PROGRAM, "scan", "--node", ready["url"]])
+                quietly = ["--json"] if args.json else []
+                swept = subprocess.run(
+                    [*PROGRAM, "scan", "--node", ready["url"], *quietly], stdout=sys.stderr if args.json else None
+                )
                 if swept.returncode:
                     return swept.returncode
+                if args.once:
+                    import asyncio
+
+                    return asyncio.run(look_once(args, ready["url"], folder))
                 print(f"The scan is at {ready['url']}\nCtrl-C ends the demo.", flush=True)
                 return node.wait()
 
 
-def _simulate(args: argparse.Namespace, link: str) -> list[str]:
-    command = ["simulate", "--link", "pty", "--path", link, "--json"]
+async def look_once(args: argparse.Namespace, url: str, folder: str) -> int:
+    """Find the node, open its newest scan, look at three places and hold what came against the truth; 0 when it holds."""
+    from client import connect, discover
+    from client.truth import Truth
+
+    truth = Truth.read(f"{folder}/truth.npz")
+    started_s = time.monotonic()
+    nodes = await discover()
+    found_s = time.monotonic() - started_s
+    if url not in {node.url for node in nodes}:
+        raise FoveascanError(f"the node at {url} was not discovered; does this machine allow multicast on loopback?")
+    async with connect(url) as session:
+        model = await session.open()
+        first_view_bytes = session.stats.bytes_received
+        updates = []
+        for u, v in truth.clicks(DEMO_CLICKS):
+            update = await session.look(u, v)
+            updates.append({
+                "u": u, "v": v, "bytes": update.bytes_received, "elapsed_s": round(update.elapsed_s, 4),
+                **truth.compare(model, u, v),
+            })  # fmt: skip
+        model.export(f"{folder}/model.npz")
+    result = {
+        "scan": model.info.id, "shape": {"range": model.range_steps.shape, "texture": model.texture.shape[:2]},
+        "link_rate": args.link_rate, "discovered_in_s": round(found_s, 3), "first_view_bytes": first_view_bytes,
+        "updates": updates, "ok": all(update["ok"] for update in updates),
+    }  # fmt: skip
+    print(json.dumps(result) if args.json else _told(result), flush=True)
+    return 0 if result["ok"] else FAILED
+
+
+def _told(result: dict[str, Any]) -> str:
+    lines = [f"first view {result['first_view_bytes']} bytes, found in {result['discovered_in_s']} s"]
+    for update in result["updates"]:
+        lines.append(
+            f"({update['u']:.3f}, {update['v']:.3f}): {update['bytes']} bytes in {update['elapsed_s']:.3f} s, "
+            f"range within {update['range_error_mm_p99']:.3f} mm (99%), texture {update['texture_psnr_db']:.1f} dB"
+        )
+    return "\n".join([*lines, "matches the truth" if result["ok"] else "does NOT match the truth"])
+
+
+def _simulate(args: argparse.Namespace, link: str, truth: str) -> list[str]:
+    command = ["simulate", "--link", "pty", "--path", link, "--truth", truth, "--json"]
     for option in ("specimen", "texture", "size", "link_rate"):
         if (value := getattr(args, option)) is not None:
             command += [f"--{option.replace('_', '-')}", value]
