@@ -1,0 +1,11 @@
+"""Scans as files: what other programs read and write. -> protocol
+
+    formats     the one place to start: which suffix is which format, read and write by it
+    mesh        the triangles of a grid, a band of rows at a time; glb, ply, obj, stl write them
+    native      the grid itself as .npz, read and written without loss
+    mesh_file   triangles of anybody's mesh; cast turns them into a grid
+    echo        Cyberware Echo range images
+    image, whole_file, errors
+
+Node, client and simulators share it; it knows neither of them, nor any wire.
+"""

@@ -1,0 +1,121 @@
+"""Which suffix is which format: the one place to ask when a scan is to become a file, or a file a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, BinaryIO
+
+from exchange.errors import ExchangeError
+from protocol.grid import Grid, ImageArray
+
+if TYPE_CHECKING:
+    from exchange.mesh_file import Placing
+
+Writer = Callable[[Grid, BinaryIO], None]
+Size = tuple[int, int, int, int]
+
+MEDIA_TYPES: Mapping[str, str] = MappingProxyType(
+    {
+        ".glb": "model/gltf-binary",
+        ".ply": "application/octet-stream",
+        ".obj.zip": "application/zip",
+        ".stl": "model/stl",
+        ".npz": "application/zip",
+    }
+)
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".bmp")
+DEFAULT_SIZE: Size = (1440, 1024, 4096, 2048)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshOptions:
+    """What a mesh does not say itself. size : W, H, Wt, Ht.  placing : None: as its format demands.  See fit_spec."""
+
+    size: Size = DEFAULT_SIZE
+    placing: Placing | None = None
+    theta0_rad: float = 0.0
+
+
+def suffix_of(name: str | Path) -> str:
+    """The suffix of a format we write. Raises ExchangeError for any other."""
+    text = Path(name).name.lower()
+    for suffix in MEDIA_TYPES:
+        if text.endswith(suffix):
+            return suffix
+    raise ExchangeError(f"{name}: cannot tell its format; end it in {', '.join(MEDIA_TYPES)}")
+
+
+def writer_of(suffix: str) -> Writer:
+    """What writes the format of a suffix that `suffix_of` gave."""
+    match suffix:
+        case ".glb":
+            from exchange.glb import write_glb as write
+        case ".ply":
+            from exchange.ply import write_ply as write
+        case ".obj.zip":
+            from exchange.obj import write_obj_zip as write
+        case ".stl":
+            from exchange.stl import write_stl as write
+        case _:
+            from exchange.native import write_native as write
+    return write
+
+
+def read_scan(
+    path: Path,
+    texture_path: Path | None = None,
+    options: MeshOptions = MeshOptions(),
+    progress: Callable[[float], object] = lambda share: None,
+) -> tuple[str, Grid]:
+    """A scan and its name, from a grid (.npz), an Echo file (known by its content) or a mesh.
+
+    texture_path : its colour; an Echo file takes the image of its own name beside it.  progress : share done, 0..1.
+    Raises ExchangeError that names the file and the field at fault, OSError for a file that cannot be opened.
+    """
+    try:
+        name, grid = _read(path, texture_path, options, progress)
+    except ExchangeError as problem:
+        raise problem if str(path) in str(problem) else ExchangeError(f"{path}: {problem}") from problem
+    return name or path.stem, grid
+
+
+def _read(
+    path: Path, texture_path: Path | None, options: MeshOptions, progress: Callable[[float], object]
+) -> tuple[str, Grid]:
+    from exchange.echo import HEADER_BYTES_MAX, is_echo, read_echo
+    from exchange.native import read_native
+
+    with open(path, "rb") as file:
+        head = file.read(HEADER_BYTES_MAX)
+        file.seek(0)
+        if path.suffix.lower() == ".npz":
+            return read_native(file, _image(texture_path))
+        if is_echo(head):
+            return read_echo(file, _image(texture_path or _image_beside(path)))
+    return "", _read_mesh(path, _image(texture_path), options, progress)
+
+
+def _read_mesh(
+    path: Path, texture: ImageArray | None, options: MeshOptions, progress: Callable[[float], object]
+) -> Grid:
+    from exchange.cast import cast_mesh, fit_spec
+    from exchange.mesh_file import SUFFIXES, Placing, read_mesh
+
+    if path.suffix.lower() not in SUFFIXES:
+        raise ExchangeError(f"no scan: expected an Echo file, .npz, {', '.join(SUFFIXES)}")
+    mesh = read_mesh(path, options.placing or Placing(), texture)
+    return cast_mesh(mesh, fit_spec(mesh, options.size, options.theta0_rad), progress)
+
+
+def _image(path: Path | None) -> ImageArray | None:
+    from exchange.image import read_image
+
+    return None if path is None else read_image(path)
+
+
+def _image_beside(path: Path) -> Path | None:
+    beside = (path.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)
+    return next((image for image in beside if image.is_file()), None)

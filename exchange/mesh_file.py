@@ -1,0 +1,175 @@
+"""Meshes as other programs write them (GLB, glTF, OBJ, PLY, STL, OFF), read by trimesh, in the turntable's frame."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from exchange.cast import Mesh
+from exchange.errors import ExchangeError
+from protocol.grid import HEIGHT_MAX, WIDTH_MAX, FloatArray, ImageArray
+
+FILE_BYTES_MAX = 1 << 30
+JSON_BYTES_MAX = 1 << 26
+FACES_MAX = 20_000_000
+GREY = 128
+MM_PER_M = 1000.0
+
+# Rows: where x, y and z of the turntable come from.
+UP: Mapping[str, FloatArray] = MappingProxyType(
+    {
+        "z": np.eye(3),
+        "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+        "x": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+        "-z": np.diag([1.0, -1, -1]),
+        "-y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+        "-x": np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]]),
+    }
+)
+GLTF = (".glb", ".gltf")
+SUFFIXES = (*GLTF, ".obj", ".ply", ".stl", ".off")
+
+
+@dataclass(frozen=True, slots=True)
+class Placing:
+    """How a mesh stands on the turntable.
+
+    up : the file's axis that points up (a key of UP).    unit_mm : millimetres of the file's unit.
+    centred : put the middle of its bounds on the axis, else the axis is where the file has it.
+    None: as the format demands: glTF in metres with y up; any other in millimetres with z up.
+    """
+
+    up: str | None = None
+    unit_mm: float | None = None
+    centred: bool = False
+
+
+def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | None = None) -> Mesh:
+    """The triangles of a file. texture : an image instead of the file's own.
+
+    Without texture or colours a face is grey. Raises ExchangeError for a file that is no mesh we read, or one that
+    stands beside the axis; OSError for one that cannot be opened.
+    """
+    suffix = path.suffix.lower()
+    if path.stat().st_size > FILE_BYTES_MAX:
+        raise ExchangeError(f"{path}: larger than {FILE_BYTES_MAX} bytes")
+    if suffix in GLTF:
+        _check_gltf(path)
+    parts = [_part(geometry, texture) for geometry in _load(path)]
+    mesh = _joined(path, parts)
+    up = placing.up or ("y" if suffix in GLTF else "z")
+    unit_mm = placing.unit_mm or (MM_PER_M if suffix in GLTF else 1.0)
+    corners = mesh.corners @ UP[up].T * unit_mm
+    return Mesh(_on_axis(path, corners, placing.centred), mesh.image, mesh.uv, mesh.colours, mesh.images)
+
+
+def _load(path: Path) -> list[trimesh.Trimesh]:
+    """Every mesh of a file where its scene puts it."""
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh)]
+    except OSError:
+        raise
+    except Exception as problem:  # readers of a dozen formats raise whatever comes to their mind over bad bytes
+        raise ExchangeError(f"{path}: no mesh we can read: {type(problem).__name__}: {problem}") from problem
+    faces = sum(len(geometry.faces) for geometry in found)
+    if not 0 < faces <= FACES_MAX:
+        raise ExchangeError(f"{path}: faces: {faces}, expected 1 to {FACES_MAX}")
+    return found
+
+
+def _part(geometry: trimesh.Trimesh, texture: ImageArray | None) -> Mesh:
+    faces = np.asarray(geometry.faces)
+    if faces.min() < 0 or faces.max() >= len(geometry.vertices):
+        raise ExchangeError("faces: a vertex that does not exist")
+    corners = np.asarray(geometry.vertices, np.float64)[faces]
+    visual = geometry.visual
+    uv = getattr(visual, "uv", None)
+    image = texture if texture is not None else _image(visual)
+    if uv is not None and image is not None and len(uv) == len(geometry.vertices):
+        return _coloured(corners, np.asarray(uv, np.float32)[faces], None, image)
+    return _coloured(corners, None, _corner_colours(visual, faces), None)
+
+
+def _coloured(corners: FloatArray, uv: Any, colours: Any, image: ImageArray | None) -> Mesh:
+    """One part; uv, or colours, or neither for grey."""
+    m = len(corners)
+    uv = np.zeros((m, 3, 2), np.float32) if uv is None else uv
+    colours = np.broadcast_to(np.uint8(GREY), (m, 3, 3)) if colours is None else colours
+    return Mesh(corners, np.full(m, -1 if image is None else 0), uv, colours, () if image is None else (image,))
+
+
+def _image(visual: Any) -> ImageArray | None:
+    """The picture of a material as trimesh found it (a Pillow image), bounded before it is decoded."""
+    material = getattr(visual, "material", None)
+    picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if picture is None:
+        return None
+    if picture.width > WIDTH_MAX or picture.height > HEIGHT_MAX:
+        raise ExchangeError(f"texture: {picture.width} x {picture.height} texels, at most {WIDTH_MAX} x {HEIGHT_MAX}")
+    try:
+        return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as problem:
+        raise ExchangeError(f"texture: {problem}") from problem
+
+
+def _corner_colours(visual: Any, faces: Any) -> Any:
+    kind = getattr(visual, "kind", None)
+    if kind == "vertex":
+        return np.asarray(visual.vertex_colors, np.uint8)[:, :3][faces]
+    if kind == "face":
+        return np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
+    return None
+
+
+def _joined(path: Path, parts: list[Mesh]) -> Mesh:
+    images: list[ImageArray] = []
+    numbers = []
+    for part in parts:
+        numbers.append(np.where(part.image < 0, -1, part.image + len(images)))
+        images += part.images
+    corners, uv, colours = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "uv", "colours")
+    )
+    if not np.isfinite(corners).all() or not np.isfinite(uv).all():
+        raise ExchangeError(f"{path}: vertices: a coordinate is not finite")
+    return Mesh(corners, np.concatenate(numbers), uv, colours, tuple(images))
+
+
+def _on_axis(path: Path, corners: FloatArray, centred: bool) -> FloatArray:
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    if centred:
+        middle: FloatArray = (low + high) / 2 * (1, 1, 0)
+        return np.subtract(corners, middle)
+    if (low[:2] > 0).any() or (high[:2] < 0).any():
+        raise ExchangeError(f"{path}: stands beside the axis x = y = 0 of the turntable; centre it: --centre")
+    return corners
+
+
+def _check_gltf(path: Path) -> None:
+    """Bound what the counts in a glTF make its reader allocate: an accessor without data is filled with zeros."""
+    try:
+        accessors = json.loads(_gltf_json(path)).get("accessors", [])
+        for number, accessor in enumerate(accessors):
+            if not 0 <= int(accessor["count"]) <= 3 * FACES_MAX:
+                raise ExchangeError(f"{path}: accessors[{number}].count: {accessor['count']}, at most {3 * FACES_MAX}")
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, struct.error) as problem:
+        raise ExchangeError(f"{path}: no glTF: {type(problem).__name__}: {problem}") from problem
+
+
+def _gltf_json(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        size = JSON_BYTES_MAX
+        if path.suffix.lower() == ".glb":
+            magic, _, _, size, kind = struct.unpack("<4sIII4s", file.read(20))
+            if magic != b"glTF" or kind != b"JSON" or size > JSON_BYTES_MAX:
+                raise ValueError(f"a first chunk {kind!r} of {size} bytes")
+        return file.read(size)

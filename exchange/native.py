@@ -1,0 +1,138 @@
+"""The grid itself as .npz: every sample, bit for bit.
+
+    depth_u16   (H, W) uint16 steps, 0 = void      texture  (Ht, Wt, 3) uint8 RGB; may stand beside as an image
+    scale_mm    millimetres of a step              name     what to call it; optional
+    z_min_mm, z_max_mm  bottom edge of the last row, top edge of row 0
+    theta0_rad  angle of the left edge of column 0
+    pitch_mm    height of a row, exactly; optional: (z_max_mm - z_min_mm) / H, which may be off by a rounding
+
+The keys are those of make_cyl.py. What a member says of its shape is checked before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from exchange.errors import ExchangeError
+from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Grid, GridSpec, ImageArray
+
+NAME_MAX = 200
+MEMBERS_MAX = 64
+ARRAY_BYTES_MAX = WIDTH_MAX * HEIGHT_MAX * 3
+PITCH_TOLERANCE = 1e-9
+Shape = tuple[int, ...]
+
+
+def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
+    """Write a grid so that `read_native` gives the very same one."""
+    spec = grid.spec
+    np.savez(
+        file,
+        depth_u16=np.asarray(grid.range_steps, "<u2"),
+        texture=grid.texture,
+        scale_mm=np.float64(spec.step_mm),
+        z_min_mm=np.float64(spec.z_max_mm - spec.height * spec.pitch_mm),
+        z_max_mm=np.float64(spec.z_max_mm),
+        theta0_rad=np.float64(spec.theta0_rad),
+        pitch_mm=np.float64(spec.pitch_mm),
+        name=np.str_(name[:NAME_MAX]),
+    )
+
+
+def read_native(
+    file: BinaryIO, texture: ImageArray | None = None, array_bytes_max: int = ARRAY_BYTES_MAX
+) -> tuple[str, Grid]:
+    """A grid and its name ("" where the file has none).
+
+    texture : taken instead of the file's own.    array_bytes_max : bound on each array, checked before it is read.
+    Raises ExchangeError that names the member at fault.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return _read(_Members(archive, array_bytes_max), texture)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as problem:
+        raise ExchangeError(f"no .npz grid: {problem}") from problem
+
+
+class _Members:
+    """The arrays in an archive, each bounded before it is read."""
+
+    def __init__(self, archive: zipfile.ZipFile, array_bytes_max: int) -> None:
+        self._archive = archive
+        self._bytes_max = array_bytes_max
+        self._names = {member.filename for member in archive.infolist()}
+        if len(archive.infolist()) > MEMBERS_MAX:
+            raise ExchangeError(f"no .npz grid: {len(archive.infolist())} members, at most {MEMBERS_MAX}")
+
+    def __contains__(self, key: str) -> bool:
+        return f"{key}.npy" in self._names
+
+    def array(self, key: str, dtype: str, dimensions: int) -> NDArray[Any]:
+        if key not in self:
+            raise ExchangeError(f"{key}: missing")
+        with self._archive.open(f"{key}.npy") as member:
+            try:
+                shape, fortran, found = _header(member)  # type: ignore[arg-type]
+            except ValueError as problem:
+                raise ExchangeError(f"{key}: {problem}") from None
+            if not np.issubdtype(found, dtype) or len(shape) != dimensions:
+                raise ExchangeError(f"{key}: expected {dimensions} dimensions of {dtype}, got {found}{list(shape)}")
+            size_bytes = math.prod(shape) * found.itemsize
+            if size_bytes > self._bytes_max:
+                raise ExchangeError(f"{key}: {size_bytes} bytes, at most {self._bytes_max}")
+            data = member.read(size_bytes)
+            if len(data) != size_bytes or member.read(1):
+                raise ExchangeError(f"{key}: {len(data)} of {size_bytes} bytes, or more than them")
+        return np.frombuffer(data, found).reshape(shape, order="F" if fortran else "C")
+
+    def number(self, key: str) -> float:
+        value = float(self.array(key, "number", 0))
+        if not math.isfinite(value):
+            raise ExchangeError(f"{key}: must be finite, got {value}")
+        return value
+
+
+def _header(member: BinaryIO) -> tuple[Shape, bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(member)
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(member)
+    if version == (2, 0):
+        return np.lib.format.read_array_header_2_0(member)
+    raise ValueError(f"version {version} of the array format")
+
+
+def _read(members: _Members, texture: ImageArray | None) -> tuple[str, Grid]:
+    if texture is None and "texture" not in members:
+        raise ExchangeError("texture: missing; give its image with --texture")
+    depth = members.array("depth_u16", "uint16", 2).astype(np.uint16, copy=False)
+    texels: ImageArray = members.array("texture", "uint8", 3) if texture is None else texture
+    try:
+        return _name(members), Grid(_spec(members, depth.shape, texels.shape), depth, texels)
+    except ValueError as problem:
+        raise ExchangeError(str(problem)) from problem
+
+
+def _spec(members: _Members, depth: Shape, texture: Shape) -> GridSpec:
+    z_min_mm, z_max_mm = members.number("z_min_mm"), members.number("z_max_mm")
+    pitch_mm = between_mm = (z_max_mm - z_min_mm) / max(depth[0], 1)
+    if "pitch_mm" in members:
+        pitch_mm = members.number("pitch_mm")
+        if abs(pitch_mm - between_mm) > PITCH_TOLERANCE * max(abs(z_min_mm), abs(z_max_mm), 1):
+            raise ExchangeError(f"pitch_mm: {pitch_mm} contradicts z_min_mm and z_max_mm, which give {between_mm}")
+    step_mm, theta0_rad = members.number("scale_mm"), members.number("theta0_rad")
+    return GridSpec(depth[1], depth[0], texture[1], texture[0], step_mm, pitch_mm, z_max_mm, theta0_rad)
+
+
+def _name(members: _Members) -> str:
+    if "name" not in members:
+        return ""
+    name = str(members.array("name", "str", 0))
+    if len(name) > NAME_MAX:
+        raise ExchangeError(f"name: {len(name)} characters, at most {NAME_MAX}")
+    return name
