@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import random
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -16,9 +17,11 @@ from drivers.port import Port
 from drivers.scanner import (
     Scanner,
     ScannerConfig,
+    SweepEvent,
     SweepFinished,
     SweepInterrupted,
     SweepProgress,
+    SweepReport,
     SweepStarted,
 )
 from node.assemble import Assembler, Encoder
@@ -29,6 +32,7 @@ from protocol.scanner_messages import RangeColumn, SweepHeader, SweepRequest, Te
 log = logging.getLogger(__name__)
 
 BACKOFF_S = (0.5, 8.0)
+LISTEN_S = 1.0
 
 Phase = Literal["no scanner", "connecting", "ready", "sweeping", "stopped"]
 
@@ -47,12 +51,22 @@ class Capture:
     """Runs sweeps in a thread of its own.
 
     open_port : opens the port, raising PortLost.   deliver : takes each finished grid, in the capture thread.
+    watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
+    SweepInterrupted for it, whatever the scanner said.
     """
 
-    def __init__(self, open_port: Callable[[], Port], config: ScannerConfig, deliver: Callable[[Grid], None]) -> None:
+    def __init__(
+        self,
+        open_port: Callable[[], Port],
+        config: ScannerConfig,
+        deliver: Callable[[Grid], None],
+        watch: Callable[[SweepEvent], None] = lambda event: None,
+    ) -> None:
         self._open_port = open_port
         self._config = config
         self._deliver = deliver
+        self._watch = watch
+        self._beat_s = time.monotonic()
         self._stop = threading.Event()
         self._wanted = threading.Event()
         self._wake = threading.Event()
@@ -63,6 +77,11 @@ class Capture:
     def status(self) -> CaptureStatus:
         """What is going on now."""
         return self._status
+
+    @property
+    def beat_s(self) -> float:
+        """When the thread last showed that it gets on. [s, time.monotonic]"""
+        return self._beat_s
 
     def start(self) -> None:
         """Begin to connect."""
@@ -94,8 +113,12 @@ class Capture:
                     log.warning("scanner: %s", error)
                 self._status = replace(self._status, phase="connecting", progress=0.0, why=str(error))
                 failures += 1
+            self._beat()
             self._stop.wait(min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures, 8)) * random.uniform(0.5, 1.0))
         self._status = replace(self._status, phase="stopped")
+
+    def _beat(self) -> None:
+        self._beat_s = time.monotonic()
 
     def _serve_port(self) -> None:
         """Connect and sweep as asked until stopped. Raises DriverError."""
@@ -105,7 +128,8 @@ class Capture:
             scanner.hello()
             self._status = replace(self._status, phase="ready", why="")
             while not self._stop.is_set():
-                self._wake.wait()
+                self._beat()
+                self._wake.wait(LISTEN_S)
                 self._wake.clear()
                 if self._wanted.is_set() and not self._stop.is_set():
                     self._sweep(scanner)
@@ -118,12 +142,15 @@ class Capture:
         try:
             self._follow(scanner)
         except (RemoteWireError, ValueError) as error:  # a sweep that contradicts itself or fits no grid
+            self._watch(SweepInterrupted(str(error), None, SweepReport()))
             raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
 
     def _follow(self, scanner: Scanner) -> None:
         """One sweep, from its header to the grid that it makes."""
         assembler: Assembler | None = None
         for event in scanner.sweep(SweepRequest(), self._stop):
+            self._beat()
+            self._watch(event)
             match event:
                 case SweepStarted(header):
                     assembler = Assembler(header.spec, encoder_of(header))
@@ -145,6 +172,7 @@ class Capture:
         except FoveascanError as error:
             why = str(error)
             log.error("the sweep was not kept: %s", error)
+            self._watch(SweepInterrupted(why, None, SweepReport()))
         sweeps = self._status.sweeps + (not why)
         self._status = CaptureStatus("ready", 0.0, sweeps, why)
 

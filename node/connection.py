@@ -1,7 +1,8 @@
 """One client's stream: reads what it asks, plans the newest look, sends one update at a time.
 
-Two tasks share a connection. The reader takes messages as they come and never waits for anything slow; the sender opens
-scans and answers looks, one update unacknowledged at a time. A newer look supersedes one that is not sent yet.
+Three tasks share a connection. The reader takes messages as they come and never waits for anything slow; the sender
+opens scans and answers looks, one update unacknowledged at a time. A newer look supersedes one that is not sent yet.
+The third shows a running sweep to a client that watches, in small messages that a look may overtake.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from node.auth import Auth
 from node.exhibits import Exhibits
 from node.foveate import Update, plan_update
 from node.library import Scan
+from node.live import Live, LiveSaid, Place
 from node.rate import RateControl
 from node.state import ClientState
 from protocol import messages as m
@@ -53,12 +55,16 @@ class Connection:
         socket: web.WebSocketResponse,
         auth: Auth,
         exhibits: Exhibits,
+        live: Live,
         info: m.ServerInfo,
         cold_start_bytes_s: float,
     ) -> None:
         self._socket = socket
         self._auth = auth
         self._exhibits = exhibits
+        self._live = live
+        self._place: Place | None = None
+        self._live_news = asyncio.Event()
         self._info = info
         self._session = Session(Role.NODE)
         self._rate = RateControl(cold_start_bytes_s)
@@ -80,9 +86,10 @@ class Connection:
             if not await self._let_in():
                 return
             async with asyncio.TaskGroup() as tasks:
-                sender = tasks.create_task(self._answer())
+                senders = [tasks.create_task(self._answer()), tasks.create_task(self._show_live())]
                 await self._read()
-                sender.cancel()
+                for sender in senders:
+                    sender.cancel()
         except* RemoteWireError as errors:
             await self._turn_away(str(errors.exceptions[0]))
         except* (ConnectionError, TimeoutError):
@@ -92,6 +99,10 @@ class Connection:
         """Tell the client of a new scan, when it is listening."""
         self._news.append(m.Published(scan_id))
         self._work.set()
+
+    def show_live(self) -> None:
+        """There is news of the running sweep."""
+        self._live_news.set()
 
     async def close(self, reason: str) -> None:
         """Say goodbye and end the stream."""
@@ -135,6 +146,9 @@ class Connection:
                     await self._take_ack(message)
                 case m.State():
                     await self._take_state(message)
+                case m.Watch(live=live):
+                    self._place = Place() if live else None
+                    self._live_news.set()
 
     async def _receive(self) -> m.Message | None:
         """The next message, or None when the stream has ended. Raises RemoteWireError."""
@@ -272,6 +286,16 @@ class Connection:
             )  # fmt: skip
         )
 
+    async def _show_live(self) -> None:
+        """Send what is new in the running sweep, as long as the client watches."""
+        while True:
+            await self._live_news.wait()
+            self._live_news.clear()
+            while (place := self._place) is not None and (news := self._live.next(place)):
+                for said in news:
+                    if self._session.phase is Phase.READY:  # else we have said goodbye meanwhile
+                        await self._send_live(said)
+
     # -- writing ---------------------------------------------------------------------------------------------------
 
     def _begin_timing(self) -> None:
@@ -281,6 +305,13 @@ class Connection:
         text = self._session.send(message)
         assert isinstance(text, str)
         await self._socket.send_str(text)
+
+    async def _send_live(self, said: LiveSaid) -> None:
+        wire = self._session.send(said)
+        if isinstance(wire, str):
+            await self._socket.send_str(wire)
+        else:
+            await self._send_bytes(wire)
 
     async def _send_bytes(self, data: bytes) -> None:
         self._sent_bytes += len(data)

@@ -21,6 +21,7 @@ from node.config import Config
 from node.exhibits import Exhibits
 from node.identity import node_identity
 from node.library import About, Library
+from node.live import Live
 from node.serve import NodeServer
 from protocol import messages as m
 from protocol.grid import Grid
@@ -49,12 +50,13 @@ async def start_node(config: Config, stack: AsyncExitStack) -> str:
         log.warning("library: %s left alone: %s", problem.name, problem.reason)
     exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers)
     stack.callback(exhibits.close)
-    capture, announce = _capture(config, library)
+    loop = asyncio.get_running_loop()
+    live = Live(lambda: loop.call_soon_threadsafe(server.show_live), config.first_view.max_bytes)
+    capture, announce = _capture(config, library, live)
     info = _server_info(config, folder)
-    server = NodeServer(config, info, exhibits, capture)
+    server = NodeServer(config, info, exhibits, live, capture)
     host, port = await server.start()
     stack.push_async_callback(server.stop)
-    loop = asyncio.get_running_loop()
     announce.append(lambda scan_id: loop.call_soon_threadsafe(server.publish, scan_id))
     if capture is not None:
         capture.start()
@@ -64,7 +66,7 @@ async def start_node(config: Config, stack: AsyncExitStack) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
-def _capture(config: Config, library: Library) -> tuple[Capture | None, list[Callable[[str], object]]]:
+def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | None, list[Callable[[str], object]]]:
     """The capture thread's owner, and the list of who is told of each new scan."""
     announce: list[Callable[[str], object]] = []
     path = config.capture.scanner
@@ -77,10 +79,11 @@ def _capture(config: Config, library: Library) -> tuple[Capture | None, list[Cal
     def deliver(grid: Grid) -> None:
         scan = library.add(grid, About(time.time()))
         log.info("scan published: %d x %d", grid.spec.width, grid.spec.height)
+        live.published(scan.id)
         for tell in announce:
             tell(scan.id)
 
-    return Capture(open_port, ScannerConfig(quiet_s=config.capture.stale_s), deliver), announce
+    return Capture(open_port, ScannerConfig(quiet_s=config.capture.stale_s), deliver, live.watch), announce
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:

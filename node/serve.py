@@ -18,6 +18,7 @@ from node.connection import Connection
 from node.exhibits import Exhibits
 from node.first_view import scan_info
 from node.library import ScanSummary
+from node.live import Live
 from protocol import messages as m
 from protocol.errors import LibraryError
 
@@ -40,10 +41,13 @@ SECURITY_HEADERS = {
 class NodeServer:
     """The node as clients see it; everything here runs in one event loop."""
 
-    def __init__(self, config: Config, info: m.ServerInfo, exhibits: Exhibits, capture: Capture | None) -> None:
+    def __init__(
+        self, config: Config, info: m.ServerInfo, exhibits: Exhibits, live: Live, capture: Capture | None
+    ) -> None:
         self._config = config
         self._info = info
         self._exhibits = exhibits
+        self._live = live
         self._capture = capture
         self._auth = Auth(config.server)
         self._connections: set[Connection] = set()
@@ -80,6 +84,11 @@ class NodeServer:
         """Tell every client of a new scan."""
         for connection in self._connections:
             connection.publish(scan_id)
+
+    def show_live(self) -> None:
+        """Send every client that watches what is new in the running sweep."""
+        for connection in self._connections:
+            connection.show_live()
 
     # -- what may be asked -----------------------------------------------------------------------------------------
 
@@ -126,7 +135,7 @@ class NodeServer:
         await stream.prepare(request)
         _bound_buffers(request)
         cold_start = self._config.planner.cold_start_bytes_s
-        connection = Connection(stream, self._auth, self._exhibits, self._info, cold_start)
+        connection = Connection(stream, self._auth, self._exhibits, self._live, self._info, cold_start)
         self._connections.add(connection)
         try:
             await connection.run()
