@@ -139,7 +139,7 @@ def run_demo(args: argparse.Namespace) -> int:
 
 
 async def look_once(args: argparse.Namespace, url: str, folder: str) -> int:
-    """Find the node, open its newest scan, look at three places and hold what came against the truth; 0 when it holds."""
+    """Find the node, open its newest scan, look at three places, hold what came against the truth; 0 when it holds."""
     from client import connect, discover
     from client.truth import Truth
 

@@ -1,4 +1,4 @@
-"""A sweep becomes a model on another machine: the acceptance tests of the default profile, through the public client."""
+"""A sweep becomes a model on another machine: acceptance tests of the default profile, through the public client."""
 
 from __future__ import annotations
 
@@ -31,10 +31,8 @@ FIRST_VIEW_MAX = 32 * 1024
 
 async def test_discovered_within_5_s_and_gone_within_5_s_of_sigterm(tmp_path: Path) -> None:  # AT-01
     name = f"at-01-{tmp_path.name}"
-    with started("serve", "--library", str(tmp_path), "--listen", "127.0.0.1:0", "--insecure", "--json", "--name", name) as (
-        process,
-        ready,
-    ):
+    serve = ["serve", "--library", str(tmp_path), "--listen", "127.0.0.1:0", "--insecure", "--json", "--name", name]
+    with started(*serve) as (process, ready):
         found = await discover(5, name)
         assert [node.url for node in found] == [ready["url"]]
         began = time.monotonic()
@@ -81,7 +79,9 @@ async def test_explicit_spacing_1_is_exact(head_node: RunningNode) -> None:  # A
         assert rmse(model, head_node, near) <= 0.25 * coarse
 
 
-async def test_turned_object_gives_the_turned_model(line: Callable[..., RunningNode], tmp_path: Path, head_node: RunningNode) -> None:  # AT-08
+async def test_turned_object_gives_the_turned_model(
+    line: Callable[..., RunningNode], tmp_path: Path, head_node: RunningNode
+) -> None:  # AT-08
     columns = 72
     turned_file = tmp_path / "turned.npz"
     width = head_node.truth.range_steps.shape[1]
@@ -89,7 +89,7 @@ async def test_turned_object_gives_the_turned_model(line: Callable[..., RunningN
         turned = {key: file[key] for key in file.files}
     turned["depth_u16"] = np.roll(turned["depth_u16"], columns, axis=1)
     np.savez(turned_file, **turned)
-    turned_node = line("--specimen", str(turned_file))
+    turned_node = await asyncio.to_thread(line, "--specimen", str(turned_file))
     (u, v), *_ = head_node.truth.clicks(1)
     grids = []
     for node, at in ((head_node, u), (turned_node, (u + columns / width) % 1)):
@@ -190,7 +190,8 @@ async def test_a_click_outside_the_scan_is_refused_and_the_session_goes_on(head_
 async def test_real_scans_at_s(name: str, line: Callable[..., RunningNode]) -> None:
     folder = SHARED_DATA / name
     texture = folder / f"{name}_tex_1024x256.png"
-    node = line("--specimen", str(folder / f"{name}_depth_360x100.npz"), "--texture", str(texture))
+    depth = folder / f"{name}_depth_360x100.npz"
+    node = await asyncio.to_thread(line, "--specimen", str(depth), "--texture", str(texture))
     async with connect(node.url) as session:
         model = await session.open()
         assert session.stats.bytes_received <= FIRST_VIEW_MAX
