@@ -170,8 +170,8 @@ class Session:
         look = _checked_look(
             m.Look(
                 request,
-                u,
-                v,
+                float(u),
+                float(v),
                 window,
                 texture_db,
                 range_mm,

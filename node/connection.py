@@ -276,9 +276,10 @@ class Connection:
         if update.coded:
             self._acknowledged.clear()
             self._begin_timing()
-        for coded in update.coded:
-            await self._send_bytes(coded.refinement(bound.epoch, bound.next_seq, look.request).to_bytes())
-            bound.next_seq += 1
+        first_seq = bound.next_seq
+        bound.next_seq += len(update.coded)  # at once: what is said meanwhile counts all of them
+        for seq, coded in enumerate(update.coded, first_seq):
+            await self._send_bytes(coded.refinement(bound.epoch, seq, look.request).to_bytes())
         await self._send(
             m.Updated(
                 look.request, bound.next_seq, update.reason, update.error_max_mm, update.texture_db, update.encodes,

@@ -36,16 +36,19 @@ class FirstView:
 
 
 def build_first_view(scan: Scan, codec: CodecName, max_bytes: int) -> FirstView:
-    """Encode a scan's first view within max_bytes. Raises CodecError when even the poorest texture is too large."""
+    """Encode a scan's first view within max_bytes. Raises CodecError when even the poorest texture is too large.
+
+    Range goes as quantised values, not by prediction: so a scan turned by whole coarse cells has its first view turned.
+    """
     coarse = scan.coarse
     quantum = max(1, round(QUANTUM_MM / scan.spec.step_mm))
     mask = encode_mask(~coarse.measured)
-    payload = encode_range(coarse.filled, RangeCodec.LIFT, quantum)
+    payload = encode_range(coarse.filled, RangeCodec.HTJ2K, quantum)
     view = Refinement(
-        Generator.COARSE, Channel.RANGE, 0, 0, 0, RangeCodec.LIFT, quantum, coarse.filled.size, payload, mask
+        Generator.COARSE, Channel.RANGE, 0, 0, 0, RangeCodec.HTJ2K, quantum, coarse.filled.size, payload, mask
     )
     left = max_bytes - OPENED_BYTES - 2 * OVERHEAD_BYTES - len(payload) - len(mask)
-    sent = decode_range(payload, RangeCodec.LIFT, coarse.filled.shape, quantum)
+    sent = decode_range(payload, RangeCodec.HTJ2K, coarse.filled.shape, quantum)
     sent[~coarse.measured] = VOID
     return FirstView(scan_info(scan), view, _texture(scan, codec, left), first_state(scan, sent))
 

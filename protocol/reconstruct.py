@@ -177,13 +177,13 @@ def _between(samples: ImageArray | LightArray, low: IntArray, high: IntArray, pa
 
 def paste(dense: StepArray | ImageArray, patch: StepArray | ImageArray, selection: Selection) -> None:
     """Overwrite the adopted blocks of a dense array with a patch; every other cell stays as it is."""
-    where = selection.adopted_cells()
+    where = selection.adopted_cells().view(np.uint8)
     whole = bool(selection.adopted.all())
     for rows, columns, source in selection.spans():
         if whole:
             dense[rows, columns] = patch[:, source]
         else:
-            dense[rows, columns][where[:, source]] = patch[:, source][where[:, source]]
+            cv2.copyTo(patch[:, source], where[:, source], dense[rows, columns])
 
 
 def cut(dense: StepArray | ImageArray, selection: Selection) -> StepArray | ImageArray:
