@@ -14,7 +14,7 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 
 from drivers.port import Port
 from drivers.sweep import (
@@ -44,6 +44,7 @@ from protocol.scanner_messages import (
     MINOR,
     Calibrate,
     Calibration,
+    Column,
     DeviceInfo,
     Fault,
     Order,
@@ -118,7 +119,22 @@ class Scanner:
             self._command(command)
         header = self._start()
         yield SweepStarted(header)
-        yield from self._collect(header, stop or threading.Event())
+        yield from self._collect(self._collector(header), stop or threading.Event())
+
+    def resume(
+        self, header: SweepHeader, held: Iterable[Column], stop: threading.Event | None = None
+    ) -> Generator[SweepEvent, None, None]:
+        """Go on with a sweep that this scanner began since it was switched on; `held` is what came of it before.
+
+        Events as from `sweep`, SweepStarted included and columns held excluded. A scanner that knows the sweep no
+        longer refuses, which is SweepInterrupted.
+        """
+        collector = self._collector(header)
+        for column in held:
+            collector.take_column(column)
+        collector.ask()
+        yield SweepStarted(header)
+        yield from self._collect(collector, stop or threading.Event())
 
     def watch(self, timeout_s: float) -> None:
         """Keep an ear on an idle scanner: returns when something was heard, at the port's `cancel`, or in time.
@@ -139,11 +155,14 @@ class Scanner:
 
     # -- a sweep that runs ---------------------------------------------------------------------------------------
 
-    def _collect(self, header: SweepHeader, stop: threading.Event) -> Iterator[SweepEvent]:
-        """Columns and progress until the sweep is over."""
+    def _collector(self, header: SweepHeader) -> Collector:
         assert self._info is not None
         is_live = self._info.order is Order.LIVE
-        collector = Collector(self._greeted, header, self._config, is_live, self._clock())
+        self._greeted.tick(self._clock())
+        return Collector(self._greeted, header, self._config, is_live, self._clock())
+
+    def _collect(self, collector: Collector, stop: threading.Event) -> Iterator[SweepEvent]:
+        """Columns and progress until the sweep is over."""
         try:
             while not collector.is_over:
                 event = self._next_event(self._clock() + _LOOK_UP_S)
@@ -157,7 +176,7 @@ class Scanner:
             yield collector.interrupt(str(error), error)
         finally:
             if not collector.is_over:  # the caller walked away
-                self._wave_off(header.sweep)
+                self._wave_off(collector.sweep)
 
     def _answering(self, outcomes: Iterator[SweepEvent]) -> Iterator[SweepEvent]:
         """The same events, each told to the caller after the scanner got its answer: the caller may not come back."""

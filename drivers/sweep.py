@@ -94,7 +94,7 @@ class Collector:
     ) -> None:
         self.is_over = False
         self._link = link
-        self._sweep = header.sweep
+        self.sweep = header.sweep
         self._config = config
         self._is_live = is_live
         self._ledger = Ledger(header)
@@ -111,6 +111,10 @@ class Collector:
         if is_new:
             self._received_bytes += len(column.data)
         return is_new
+
+    def ask(self) -> None:
+        """Ask for all that is missing, of a sweep that began before."""
+        self._request(self._ledger.missing())
 
     def take(self, event: Event) -> Iterator[SweepEvent]:
         """Anything but a column."""
@@ -134,7 +138,7 @@ class Collector:
             return
         if wants_stop and self._stop_s is None:
             self._stop_s = now_s
-            self._link.send(SweepStop(self._sweep))
+            self._link.send(SweepStop(self.sweep))
         if self._stop_s is not None and now_s > self._stop_s + self._config.quiet_s:
             yield self.interrupt("stopped", None)
         elif self._is_silent(silent_s):
@@ -157,11 +161,11 @@ class Collector:
 
     def _take_command(self, message: object) -> Iterator[SweepEvent]:
         match message:
-            case ColumnsGone(sweep, runs) if sweep == self._sweep:
+            case ColumnsGone(sweep, runs) if sweep == self.sweep:
                 self._ledger.give_up(runs)
             case Fault(code, text):
                 yield self._break(f"scanner error {code}: {text}")
-            case SweepEnd(sweep=sweep) if sweep == self._sweep:
+            case SweepEnd(sweep=sweep) if sweep == self.sweep:
                 yield from self._take_end(message)
 
     def _take_end(self, end: SweepEnd) -> Iterator[SweepEvent]:
@@ -187,7 +191,7 @@ class Collector:
 
     def _request(self, runs: tuple[ColumnRun, ...]) -> None:
         if runs:
-            self._link.send(RequestColumns(self._sweep, runs))
+            self._link.send(RequestColumns(self.sweep, runs))
             asked = self._tally.requested_columns + sum(run.count for run in runs)
             self._tally = replace(self._tally, requested_columns=asked)
 

@@ -276,6 +276,43 @@ def test_a_caller_that_leaves_at_the_last_event_has_answered_the_scanner() -> No
     assert bench.device._link.commands_pending == 0
 
 
+def cut_at(bench: Bench, count: int) -> list[RangeColumn | TextureColumn]:
+    """Sweep, and lose the line after some events. Returns the columns that came."""
+    columns = []
+    for number, event in enumerate(bench.scanner.sweep(SweepRequest())):
+        if isinstance(event, SweepStarted):
+            bench.header = event.header
+        elif isinstance(event, RangeColumn | TextureColumn):
+            columns.append(event)
+        if number == count:
+            bench.port.unplug()
+    bench.port = MemoryPort(bench.device)
+    bench.port._now_s = 100.0
+    bench.scanner = Scanner(bench.port, clock=bench.port.clock)
+    return columns
+
+
+@pytest.mark.parametrize("count", [1, 60, 190])
+def test_a_sweep_goes_on_where_the_line_was_lost(count: int) -> None:
+    bench = greeted(rate_bytes_s=300_000)
+    held = cut_at(bench, count)
+    bench.scanner.hello()
+    events = list(bench.scanner.resume(bench.header, held))
+    assert isinstance(events[0], SweepStarted) and isinstance(events[-1], SweepFinished)
+    columns = [event for event in events if isinstance(event, RangeColumn | TextureColumn)]
+    names = {(column.CHANNEL, column.column, column.row0) for column in (*held, *columns)}
+    assert len(held) + len(columns) == len(names) == 2 * (W + WT)
+
+
+def test_a_sweep_that_the_scanner_forgot_does_not_go_on() -> None:
+    bench = greeted(rate_bytes_s=300_000)
+    held = cut_at(bench, 60)
+    bench.scanner.hello()
+    bench.scanner._command(Reset())
+    last = list(bench.scanner.resume(bench.header, held))[-1]
+    assert isinstance(last, SweepInterrupted) and "refused" in last.reason
+
+
 def test_stop_ends_the_sweep_and_the_scanner_is_free_again() -> None:
     bench, stop = greeted(turn_s=10.0), threading.Event()
     last = bench.sweep(stop=stop, at_event=lambda count, _: stop.set() if count == 20 else None)
