@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from node.state import ClientState
-from protocol.grid import BoolArray
+from protocol.grid import BoolArray, StepArray
 from protocol.lattice import NO_SKIRT, RHO_MAX, RHO_ONE, Channel, Parameters
 from protocol.reconstruct import Selection
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
@@ -20,6 +20,7 @@ class Coded:
 
     adopted : (by, bx) bool over the lattice's covered blocks.
     rank, quality, codec : as in protocol.holdings and protocol.refinement.
+    patch : range only, the dense rectangle that a client makes of it, voids included.
     """
 
     selection: Selection
@@ -29,6 +30,7 @@ class Coded:
     codec: int
     payload: bytes
     mask: bytes = b""
+    patch: StepArray | None = None
 
     @property
     def channel(self) -> Channel:

@@ -7,7 +7,16 @@ from dataclasses import dataclass
 from node.coded import FRAME_BYTES
 from node.library import Scan
 from node.state import ClientState, first_state
-from protocol.codec import RangeCodec, TextureCodec, decode_range, encode_mask, encode_range, encode_texture
+from protocol.codec import (
+    JPEG_QUALITY_MAX,
+    JPEG_QUALITY_MIN,
+    RangeCodec,
+    TextureCodec,
+    decode_range,
+    encode_mask,
+    encode_range,
+    encode_texture,
+)
 from protocol.errors import CodecError
 from protocol.grid import VOID
 from protocol.lattice import Channel
@@ -15,7 +24,7 @@ from protocol.messages import CodecName, ScanInfo
 from protocol.refinement import CRC, HEADER, Generator, Refinement
 
 QUANTUM_MM = 0.05
-QUALITIES = tuple(range(62, 31, -3))
+QUALITIES = {"htj2k": range(62, 13, -3), "jpeg": range(JPEG_QUALITY_MAX, JPEG_QUALITY_MIN - 1, -3)}
 OPENED_BYTES = 600  # the message before it, at most
 OVERHEAD_BYTES = HEADER.size + CRC.size + FRAME_BYTES
 
@@ -67,7 +76,7 @@ def scan_info(scan: Scan) -> ScanInfo:
 def _texture(scan: Scan, codec: CodecName, max_bytes: int) -> Refinement:
     image = scan.coarse.texture
     kind = TextureCodec.JPEG if codec == "jpeg" else TextureCodec.HTJ2K
-    for quality in QUALITIES:
+    for quality in QUALITIES[codec]:
         payload = encode_texture(image, kind, quality)
         if len(payload) <= max_bytes:
             samples = image.shape[0] * image.shape[1]

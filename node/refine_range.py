@@ -14,9 +14,9 @@ from node.coded import Coded, rho_of
 from node.library import Scan
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
-from protocol.codec import RangeCodec, encode_mask, encode_range
-from protocol.codec_lift import survey
-from protocol.grid import VOID, StepArray
+from protocol.codec import RangeCodec, encode_mask
+from protocol.codec_lift import encode_and_decode, survey
+from protocol.grid import VOID
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
@@ -72,8 +72,11 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
     selection, adopted = found
     void = void_cells(scan, selection)
     samples, seen = range_samples(scan, selection)
-    payload = encode_range(samples, RangeCodec.LIFT, quantum, seen)
-    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, encode_mask(void))
+    payload, decoded = encode_and_decode(samples, quantum, seen)
+    patch = range_patch(selection, decoded)
+    patch[void] = VOID
+    mask = encode_mask(void)
+    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, mask, patch)
 
 
 def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
@@ -82,20 +85,11 @@ def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
     return Parameters(2 * wanted.p, *region.blocks(8), rho, rho)
 
 
-def client_patch(scan: Scan, coded: Coded) -> StepArray:
-    """The dense range a client makes of a refinement, voids included. (rows, columns) uint16."""
-    selection = coded.selection
-    samples, seen = range_samples(scan, selection)
-    patch = range_patch(selection, survey(samples, coded.quality, seen)[0])
-    patch[void_cells(scan, selection)] = VOID
-    return patch
-
-
 def note_range(scan: Scan, state: ClientState, coded: Coded) -> None:
     """Record a range refinement in a client's state: holdings, digest and the error left in its blocks."""
+    assert coded.patch is not None  # code_range made it
     coded.note(state)
-    patch = client_patch(scan, coded)
-    selection = coded.selection
+    patch, selection = coded.patch, coded.selection
     state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
     left = block_errors(patch, np.asarray(cut(scan.range_steps, selection)))
     rows, columns = np.nonzero(selection.adopted)

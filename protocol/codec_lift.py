@@ -34,19 +34,31 @@ def encode(range_steps: StepArray, quantum: int, care: BoolArray | None = None) 
 
     care : (h, w) bool, False where any value will do.
     """
-    return _deflate(_pack(_analysed(range_steps, quantum, care)[1]))
+    return encode_and_decode(range_steps, quantum, care)[0]
+
+
+def encode_and_decode(
+    range_steps: StepArray, quantum: int, care: BoolArray | None = None
+) -> tuple[bytes, StepArray]:
+    """Payload as of `encode`, and what `decode` will return."""
+    decoded, missed = _analysed(range_steps, quantum, care)
+    return _deflate(_pack(missed)), _clamped(decoded)
 
 
 def survey(range_steps: StepArray, quantum: int, care: BoolArray | None = None) -> tuple[StepArray, float]:
     """What `decode` will return, and about how many bytes it will take, without coding it."""
     decoded, missed = _analysed(range_steps, quantum, care)
-    return np.clip(decoded, 1, STEPS_MAX).astype(np.uint16), _expected_bytes(missed)
+    return _clamped(decoded), _expected_bytes(missed)
 
 
 def decode(payload: bytes, shape: tuple[int, int], quantum: int) -> StepArray:
     """(h, w) uint16 steps of a payload, within 1..65535. Raises CodecError."""
     values = _Reader(_unpack(_inflate(payload, shape[0] * shape[1]), shape[0] * shape[1]))
-    return np.clip(_synthesise(values, shape, quantum), 1, STEPS_MAX).astype(np.uint16)
+    return _clamped(_synthesise(values, shape, quantum))
+
+
+def _clamped(decoded: Int32Array) -> StepArray:
+    return np.clip(decoded, 1, STEPS_MAX).astype(np.uint16)
 
 
 def _analysed(range_steps: StepArray, quantum: int, care: BoolArray | None) -> tuple[Int32Array, Int32Array]:

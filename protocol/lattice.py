@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -149,6 +150,7 @@ class Lattice:
     listed: BoolArray
 
 
+@lru_cache(maxsize=64)
 def build_lattice(shape: ChannelShape, parameters: Parameters) -> Lattice:
     """Compute a lattice from what travelled. Raises LatticeError when the parameters describe none."""
     _check(shape, parameters)
