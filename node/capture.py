@@ -1,6 +1,7 @@
 """The one thread that owns the scanner: it connects, sweeps when asked, assembles, and hands over finished grids.
 
-A lost port or a faulty scanner never ends the thread: it tries again, ever more slowly.
+A lost port or a faulty scanner never ends the thread: it tries again, ever more slowly. Columns are on their way to the
+journal before anything else is done with them; a journal is removed once its grid is delivered, and so durable.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,16 +26,19 @@ from drivers.scanner import (
     SweepReport,
     SweepStarted,
 )
-from node.assemble import Assembler, Encoder
-from protocol.errors import DriverError, FoveascanError, PortLost, RemoteWireError, ScannerFault
+from node.assemble import Assembler
+from node.journal import Interrupted, Journal, Journals
+from node.resume import add_column, cut_lately, encoder_of, publish, resumed
+from protocol.errors import DriverError, FoveascanError, LibraryError, PortLost, RemoteWireError, ScannerFault
 from protocol.grid import Grid
-from protocol.scanner_messages import RangeColumn, SweepHeader, SweepRequest, TextureColumn
+from protocol.scanner_messages import Column, DeviceInfo, RangeColumn, SweepHeader, SweepRequest, TextureColumn
 
 log = logging.getLogger(__name__)
 
 BACKOFF_S = (0.5, 8.0)
 LISTEN_S = 1.0
 
+SweepEvents = Generator[SweepEvent, None, None]
 Phase = Literal["no scanner", "connecting", "ready", "sweeping", "stopped"]
 
 
@@ -50,9 +55,11 @@ class CaptureStatus:
 class Capture:
     """Runs sweeps in a thread of its own.
 
-    open_port : opens the port, raising PortLost.   deliver : takes each finished grid, in the capture thread.
+    open_port : opens the port, raising PortLost.
+    deliver : takes each finished grid, in the capture thread, and returns once it is durable.
     watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
     SweepInterrupted for it, whatever the scanner said.
+    sweeps : where columns are kept until their grid is delivered; without it, a cut sweep is lost.
     """
 
     def __init__(
@@ -61,15 +68,18 @@ class Capture:
         config: ScannerConfig,
         deliver: Callable[[Grid], None],
         watch: Callable[[SweepEvent], None] = lambda event: None,
+        sweeps: Journals | None = None,
     ) -> None:
         self._open_port = open_port
         self._config = config
         self._deliver = deliver
         self._watch = watch
+        self._sweeps = sweeps
         self._beat_s = time.monotonic()
         self._stop = threading.Event()
-        self._wanted = threading.Event()
-        self._wake = threading.Event()
+        self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
+        self._order: SweepRequest | str | None = None  # a new sweep, or the id of one to go on with
+        self._port: Port | None = None
         self._status = CaptureStatus("connecting")
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
@@ -89,18 +99,35 @@ class Capture:
 
     def request_sweep(self) -> bool:
         """Ask for a sweep; False when one is running or asked for already."""
-        if self._status.phase == "sweeping" or self._wanted.is_set():
-            return False
-        self._wanted.set()
-        self._wake.set()
-        return True
+        return self._request(SweepRequest())
+
+    def request_resume(self, sweep_id: str) -> bool:
+        """Ask to go on with an interrupted sweep; False as for request_sweep. Raises LibraryError when unknown."""
+        if self._sweeps is None:
+            raise LibraryError("this node keeps no interrupted sweeps")
+        self._sweeps.get(sweep_id)
+        return self._request(sweep_id)
 
     def stop(self, timeout_s: float = 3.0) -> None:
         """End a running sweep and the thread."""
         self._stop.set()
-        self._wake.set()
+        self._wake()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
+
+    def _request(self, order: SweepRequest | str) -> bool:
+        with self._lock:
+            if self._status.phase == "sweeping" or self._order is not None:
+                return False
+            self._order = order
+        self._wake()
+        return True
+
+    def _wake(self) -> None:
+        """Have the thread look up from an idle port."""
+        with self._lock:
+            if self._port is not None:
+                self._port.cancel()
 
     def _run(self) -> None:
         failures = 0
@@ -111,10 +138,10 @@ class Capture:
             except DriverError as error:
                 if str(error) != self._status.why:
                     log.warning("scanner: %s", error)
+                failures = 0 if self._status.phase == "ready" else failures + 1
                 self._status = replace(self._status, phase="connecting", progress=0.0, why=str(error))
-                failures += 1
             self._beat()
-            self._stop.wait(min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures, 8)) * random.uniform(0.5, 1.0))
+            self._stop.wait(min(BACKOFF_S[1], BACKOFF_S[0] * 2**min(failures, 8)) * random.uniform(0.5, 1.0))
         self._status = replace(self._status, phase="stopped")
 
     def _beat(self) -> None:
@@ -125,64 +152,173 @@ class Capture:
         port = self._open_port()
         try:
             scanner = Scanner(port, self._config)
-            scanner.hello()
+            info = scanner.hello()
+            with self._lock:
+                self._port = port
             self._status = replace(self._status, phase="ready", why="")
+            self._go_on(scanner, info)
             while not self._stop.is_set():
                 self._beat()
-                self._wake.wait(LISTEN_S)
-                self._wake.clear()
-                if self._wanted.is_set() and not self._stop.is_set():
-                    self._sweep(scanner)
+                if (order := self._take_order()) is not None:
+                    self._obey(scanner, info, order)
+                else:
+                    scanner.watch(LISTEN_S)
         finally:
+            with self._lock:
+                self._port = None
             port.close()
 
-    def _sweep(self, scanner: Scanner) -> None:
-        self._wanted.clear()
-        self._status = replace(self._status, phase="sweeping", progress=0.0, why="")
-        try:
-            self._follow(scanner)
-        except (RemoteWireError, ValueError) as error:  # a sweep that contradicts itself or fits no grid
-            self._watch(SweepInterrupted(str(error), None, SweepReport()))
-            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
+    def _take_order(self) -> SweepRequest | str | None:
+        with self._lock:
+            order, self._order = self._order, None
+            if order is not None:
+                self._status = replace(self._status, phase="sweeping", progress=0.0, why="")
+            return order
 
-    def _follow(self, scanner: Scanner) -> None:
-        """One sweep, from its header to the grid that it makes."""
-        assembler: Assembler | None = None
-        for event in scanner.sweep(SweepRequest(), self._stop):
-            self._beat()
-            self._watch(event)
-            match event:
-                case SweepStarted(header):
-                    assembler = Assembler(header.spec, encoder_of(header))
-                case RangeColumn() if assembler:
-                    assembler.add_range_column(event.encoder, event.row0, event.samples)
-                case TextureColumn() if assembler:
-                    assembler.add_texture_column(event.encoder, event.row0, event.samples)
-                case SweepProgress(share):
-                    self._status = replace(self._status, progress=share)
-                case SweepFinished() if assembler:
-                    self._finish(assembler)
-                case SweepInterrupted(reason, cause):
-                    self._interrupted(reason, cause)
+    def _go_on(self, scanner: Scanner, info: DeviceInfo) -> None:
+        """If this very scanner was cut off in the middle of a sweep just now, ask for the rest of it."""
+        sweep = self._sweeps and cut_lately(self._sweeps.interrupted(), info, time.time())
+        if self._sweeps is None or not sweep:
+            return
+        log.info("going on with sweep %s", sweep.id)
+        self._status = replace(self._status, phase="sweeping")
+        held = list(self._sweeps.columns(sweep.id))
+        self._run_sweep(scanner.resume(sweep.header, held, self._stop), info, (sweep, held))
 
-    def _finish(self, assembler: Assembler) -> None:
-        why = ""
+    def _obey(self, scanner: Scanner, info: DeviceInfo, order: SweepRequest | str) -> None:
         try:
-            self._deliver(assembler.finish())
+            if isinstance(order, str):
+                self._resume(scanner, info, order)
+            else:
+                if self._sweeps is not None:
+                    self._sweeps.require_room()
+                self._run_sweep(scanner.sweep(order, self._stop), info, None)
+        except LibraryError as error:
+            self._end(str(error))
+
+    def _resume(self, scanner: Scanner, info: DeviceInfo, sweep_id: str) -> None:
+        """Go on with a sweep as somebody asked, or finish one that lacks nothing. Raises DriverError, LibraryError."""
+        assert self._sweeps is not None
+        sweep = self._sweeps.get(sweep_id)
+        held = list(self._sweeps.columns(sweep_id))
+        if sweep.is_complete:
+            publish(self._sweeps, sweep, self._deliver)
+            self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+        else:
+            self._run_sweep(resumed(scanner, info, sweep, held, self._stop), info, (sweep, held))
+
+    def _run_sweep(
+        self, events: SweepEvents, info: DeviceInfo, before: tuple[Interrupted, list[Column]] | None
+    ) -> None:
+        """One sweep, from its header to the grid that it makes. before : what was kept of it, if it began before.
+
+        However it ends, its columns are a scan or an interrupted sweep then, and `watch` knows. Raises DriverError.
+        """
+        running = _Running(self._sweeps, info, before)
+        try:
+            self._follow(events, running)
         except FoveascanError as error:
-            why = str(error)
-            log.error("the sweep was not kept: %s", error)
-            self._watch(SweepInterrupted(why, None, SweepReport()))
-        sweeps = self._status.sweeps + (not why)
-        self._status = CaptureStatus("ready", 0.0, sweeps, why)
+            self._watch(SweepInterrupted(str(error), None, SweepReport()))
+            running.leave(str(error))
+            self._end(str(error))
+            if isinstance(error, DriverError):
+                raise
 
-    def _interrupted(self, reason: str, cause: DriverError | None) -> None:
-        log.warning("sweep interrupted: %s", reason)
-        self._status = replace(self._status, phase="ready", progress=0.0, why=f"sweep interrupted: {reason}")
-        if isinstance(cause, PortLost):
-            raise cause
+    def _follow(self, events: SweepEvents, running: _Running) -> None:
+        """Hand every event to whom it concerns. Raises FoveascanError."""
+        with closing(events):
+            for event in events:
+                self._beat()
+                match event:
+                    case SweepStarted(header):
+                        running.begin(header)
+                        self._show(event, *running.held)
+                        continue
+                    case RangeColumn() | TextureColumn():
+                        running.take(event)
+                    case SweepProgress(share):
+                        running.flush()
+                        self._status = replace(self._status, progress=share)
+                    case SweepFinished():
+                        running.finish(self._deliver)
+                        self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+                    case SweepInterrupted(cause=PortLost() as cause):
+                        raise cause
+                    case SweepInterrupted(reason):
+                        running.leave(reason)
+                        self._end(f"sweep interrupted: {reason}")
+                self._watch(event)
+
+    def _show(self, *events: SweepEvent) -> None:
+        for event in events:
+            self._watch(event)
+
+    def _end(self, why: str) -> None:
+        log.warning("%s", why)
+        self._status = replace(self._status, phase="ready", progress=0.0, why=why)
 
 
-def encoder_of(header: SweepHeader) -> Encoder:
-    """How a sweep's encoder counts become angles."""
-    return Encoder(header.counts_per_turn, header.encoder_start, header.direction)
+class _Running:
+    """A sweep on its way: every column goes to the journal, then to the assembler.
+
+    before : what was kept of it, if it began before.  held : the columns of that.
+    """
+
+    def __init__(
+        self, sweeps: Journals | None, info: DeviceInfo, before: tuple[Interrupted, list[Column]] | None
+    ) -> None:
+        self._sweeps = sweeps
+        self._info = info
+        self._before = before
+        self.held = before[1] if before else []
+        self._journal: Journal | None = None
+        self._assembler: Assembler | None = None
+
+    def begin(self, header: SweepHeader) -> None:
+        """Make room for it. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
+        try:
+            self._assembler = Assembler(header.spec, encoder_of(header))
+        except ValueError as error:
+            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
+        if self._sweeps is not None and self._before is not None:
+            self._journal = self._sweeps.reopen(self._before[0].id)
+        elif self._sweeps is not None:
+            self._journal = self._sweeps.begin(self._info, header, time.time())
+        for column in self.held:
+            self._assemble(column)
+
+    def take(self, column: Column) -> None:
+        """Keep a column. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
+        if self._journal is not None:
+            self._journal.add(column)
+        self._assemble(column)
+
+    def flush(self) -> None:
+        """See to it that what was taken gets to the disk. Raises LibraryError."""
+        if self._journal is not None:
+            self._journal.flush()
+
+    def finish(self, deliver: Callable[[Grid], None]) -> None:
+        """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
+        assert self._assembler is not None
+        self.flush()
+        grid = self._assembler.finish()
+        if self._journal is not None:
+            self._journal.close()
+        deliver(grid)
+        if self._journal is not None and self._sweeps is not None:
+            self._sweeps.remove(self._journal.id)
+            self._journal = None
+
+    def leave(self, why: str) -> None:
+        """It ended early: what was kept of it is an interrupted sweep from now on."""
+        if self._journal is not None and self._sweeps is not None:
+            self._sweeps.keep(self._journal, why)
+            self._journal = None
+
+    def _assemble(self, column: Column) -> None:
+        assert self._assembler is not None
+        try:
+            add_column(self._assembler, column)
+        except RemoteWireError as error:
+            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error

@@ -19,7 +19,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.ledger import Ledger
@@ -47,6 +47,7 @@ RECORD_BYTES = 65536  # a record is written once its messages reach this
 PAYLOAD_BYTES_MAX = 2 * 65536
 SPARE_BYTES = 16 << 20  # what a sweep must leave free: sidecars, logs, other programs
 CUT_SHORT = "the node was cut off in the middle of it"
+COMPLETE = "it is complete, and was not published yet"
 
 _MAGIC = b"FSj\x01"
 _RECORD = struct.Struct("<4sII")  # magic, length of the payload, CRC-32 of length and payload
@@ -60,12 +61,13 @@ _ID = re.compile("[0-9a-f]{16}")
 class Interrupted:
     """A sweep that has not become a scan.
 
-    started_unix_s : by the node's clock.  info : the scanner that made it, and its boot id.  why : what ended it.
+    started_unix_s, ended_unix_s : by the node's clock.  info : the scanner that made it.  why : what ended it.
     held, expected : pieces of columns on disk, and those a complete sweep has.  damaged_bytes : rotten ones set aside.
     """
 
     id: str
     started_unix_s: float
+    ended_unix_s: float
     info: DeviceInfo
     header: SweepHeader
     held: int
@@ -88,6 +90,7 @@ class Journal:
         self._writer = BackgroundWriter(path)
         self._messages: list[bytes] = []
         self._size = 0
+        self._is_closed = False
 
     def add(self, column: Column) -> None:
         """Take a column."""
@@ -109,6 +112,9 @@ class Journal:
 
     def close(self, why: str | None = None) -> None:
         """Make everything durable and let go of the file. why : what ended the sweep, unless it ended well."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         if why is not None:
             self._take(Fault(0, why.encode()[:150].decode(errors="ignore")))
         failure: LibraryError | None = None
@@ -158,6 +164,10 @@ class Journals:
             return self._sweeps[sweep_id]
         except KeyError:
             raise LibraryError(f"no interrupted sweep {sweep_id[:40]!r}") from None
+
+    def require_room(self) -> None:
+        """Raises NoRoom when not even the smallest sweep would fit."""
+        require_room(self._folder, SPARE_BYTES, "a sweep")
 
     def begin(self, info: DeviceInfo, header: SweepHeader, started_unix_s: float) -> Journal:
         """Open the journal of a new sweep. Raises NoRoom, before anything is written, when it would not fit."""
@@ -219,13 +229,13 @@ class Journals:
         except LibraryError as error:
             self.problems.append(Problem(f"{self._folder.name}/{path.name}", str(error)))
             return
-        kind = "complete sweep that was not published yet" if sweep.is_complete else "interrupted sweep"
-        self.found.append(f"{kind} {sweep.id}: {sweep.held} of {sweep.expected} pieces of columns; {sweep.why}")
+        self.found.append(f"sweep {sweep.id}: {sweep.held} of {sweep.expected} pieces of columns; {sweep.why}")
 
     def _survey(self, path: Path) -> Interrupted:
         """Read a journal through, cut its torn tail, and list it. Raises LibraryError when it is none."""
-        size_bytes = path.stat().st_size
-        sweep = survey_journal(path.stem, _map(path))
+        file_was = path.stat()
+        size_bytes = file_was.st_size
+        sweep = replace(survey_journal(path.stem, _map(path)), ended_unix_s=file_was.st_mtime)
         if sweep.size_bytes < size_bytes:
             self.found.append(f"sweep {sweep.id}: its last {size_bytes - sweep.size_bytes} bytes were torn and are cut")
             with open(path, "r+b") as file:
@@ -279,7 +289,7 @@ def read_records(data: bytes | mmap.mmap) -> Iterator[tuple[int, memoryview]]:
 
 
 def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
-    """What a journal holds; size_bytes ends with its last whole record. Raises LibraryError when it is none."""
+    """What a journal holds, up to its last whole record. Raises LibraryError when it is none."""
     records = read_records(data)
     end, opening = next(records, (0, memoryview(b"")))
     if end != _RECORD.size + len(opening) or not opening:
@@ -293,9 +303,10 @@ def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
                 why = message.text
             elif isinstance(message, RangeColumn | TextureColumn):
                 ledger.take(message)
-    return Interrupted(
-        sweep_id, started_unix_s, info, header, ledger.held, ledger.expected, end, end - read_bytes, why
-    )
+    if ledger.held == ledger.expected:
+        why = COMPLETE
+    counts = ledger.held, ledger.expected, end, end - read_bytes
+    return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, why)
 
 
 def _record_at(data: bytes | mmap.mmap, at: int) -> memoryview | None:

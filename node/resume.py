@@ -1,0 +1,145 @@
+"""Going on with a sweep that was cut, if the scanner agrees: the same one, and nothing has moved since.
+
+A scanner that was not switched off still knows the sweep and sends what is missing. One that was, or that gave the
+sweep up, is homed; if its calibration is the same, it sweeps again, and what was kept is kept (DESIGN 5).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+
+from drivers.ledger import Ledger
+from drivers.scanner import Scanner, SweepEvent, SweepFinished, SweepInterrupted, SweepReport, SweepStarted
+from node.assemble import Assembler, Encoder
+from node.journal import Interrupted, Journals
+from protocol.errors import FoveascanError, ScannerFault
+from protocol.grid import Grid
+from protocol.scanner_messages import (
+    Column,
+    DeviceInfo,
+    RangeColumn,
+    SweepHeader,
+    SweepRequest,
+    TextureColumn,
+)
+
+RESUME_WITHIN_S = 30.0  # a cut sweep goes on by itself this soon; later, whoever stood on the table may have left it
+STOPPED = "stopped"  # how drivers.sweep calls the end that we asked for
+
+
+def resumed(
+    scanner: Scanner, info: DeviceInfo, sweep: Interrupted, held: list[Column], stop: threading.Event
+) -> Generator[SweepEvent, None, None]:
+    """What is missing of a sweep, as Scanner.sweep would tell it; its columns fit the sweep's own header.
+
+    info : the scanner that is there now.  held : the columns kept.  Raises DriverError as Scanner.sweep does.
+    """
+    if info.serial_number != sweep.info.serial_number:
+        yield _refusal(f"it was begun by scanner {sweep.info.serial_number}, this is {info.serial_number}")
+        return
+    yield SweepStarted(sweep.header)
+    ledger = Ledger(sweep.header)
+    for column in held:
+        ledger.take(column)
+    if info.boot_id == sweep.info.boot_id:
+        with closing(scanner.resume(sweep.header, held, stop)) as events:
+            for event in events:
+                if isinstance(event, SweepInterrupted) and isinstance(event.cause, ScannerFault):
+                    break  # it gave the sweep up
+                if isinstance(event, RangeColumn | TextureColumn):
+                    ledger.take(event)
+                if not isinstance(event, SweepStarted):
+                    yield event
+            else:
+                return
+    yield from _swept_again(scanner, sweep.header, ledger, stop)
+
+
+def cut_lately(sweeps: Sequence[Interrupted], info: DeviceInfo, now_unix_s: float) -> Interrupted | None:
+    """The sweep that this scanner was in the middle of when the line, or the node, went away a moment ago."""
+    for sweep in sweeps:
+        is_same = (sweep.info.serial_number, sweep.info.boot_id) == (info.serial_number, info.boot_id)
+        is_recent = 0 <= now_unix_s - sweep.ended_unix_s < RESUME_WITHIN_S
+        if is_same and is_recent and sweep.why != STOPPED and not sweep.is_complete:
+            return sweep
+    return None
+
+
+def publish_complete(sweeps: Journals, deliver: Callable[[Grid], None]) -> list[str]:
+    """Make scans of the complete sweeps that a crash kept from becoming ones. Returns what was done, or went wrong."""
+    said = []
+    for sweep in filter(lambda sweep: sweep.is_complete, sweeps.interrupted()):
+        try:
+            publish(sweeps, sweep, deliver)
+            said.append(f"published sweep {sweep.id}, which was complete")
+        except (FoveascanError, ValueError) as error:
+            said.append(f"could not publish sweep {sweep.id}: {error}")
+    return said
+
+
+def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Grid], None]) -> None:
+    """Make a scan of one complete sweep. deliver : returns once it is durable. Raises FoveascanError, ValueError."""
+    assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
+    for column in sweeps.columns(sweep.id):
+        add_column(assembler, column)
+    deliver(assembler.finish())
+    sweeps.remove(sweep.id)
+
+
+def encoder_of(header: SweepHeader) -> Encoder:
+    """How a sweep's encoder counts become angles."""
+    return Encoder(header.counts_per_turn, header.encoder_start, header.direction)
+
+
+def add_column(assembler: Assembler, column: Column) -> None:
+    """Hand a column of the link to an assembler. Raises RemoteWireError when it does not fit."""
+    if isinstance(column, RangeColumn):
+        assembler.add_range_column(column.encoder, column.row0, column.samples)
+    else:
+        assembler.add_texture_column(column.encoder, column.row0, column.samples)
+
+
+def _swept_again(
+    scanner: Scanner, header: SweepHeader, ledger: Ledger, stop: threading.Event
+) -> Iterator[SweepEvent]:
+    """Home the table and sweep once more, for the pieces that the ledger lacks."""
+    calibration = scanner.calibrate().calibration
+    if calibration != header.calibration:
+        yield _refusal("the scanner was calibrated anew since")
+        return
+    s = header.spec
+    request = SweepRequest(header.channels, header.passes, s.width, s.height, s.texture_width, s.texture_height)
+    with closing(scanner.sweep(request, stop)) as events:
+        again = header
+        for event in events:
+            if isinstance(event, SweepStarted):
+                again = event.header
+                if _as_of(again, header) != header:
+                    yield _refusal("the scanner sweeps otherwise than before")
+                    return
+            elif isinstance(event, RangeColumn | TextureColumn):
+                column = _column_as_of(event, again, header)
+                if ledger.take(column):
+                    yield column
+                if ledger.held == ledger.expected:
+                    yield SweepFinished(SweepReport(expected=ledger.expected, received=ledger.held))
+                    return
+            else:
+                yield event
+
+
+def _refusal(reason: str) -> SweepInterrupted:
+    return SweepInterrupted(reason, ScannerFault(reason), SweepReport())
+
+
+def _as_of(again: SweepHeader, header: SweepHeader) -> SweepHeader:
+    """The new sweep's header with all that may differ taken from the old one."""
+    return replace(again, sweep=header.sweep, encoder_start=header.encoder_start)
+
+
+def _column_as_of(column: Column, again: SweepHeader, header: SweepHeader) -> Column:
+    """A column of the new sweep as the old one would have named it: the encoder counts from another home."""
+    return replace(column, sweep=header.sweep, encoder=column.encoder - again.encoder_start + header.encoder_start)
