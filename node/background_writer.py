@@ -24,9 +24,7 @@ class BackgroundWriter:
         self._changed = threading.Condition()
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
-        self._busy = False
-        self._unsafe = False
-        self._hurry = False  # somebody waits until all is durable
+        self._unsafe = False  # something was written and is not durable yet
         self._closing = False
         self._failure: OSError | None = None
         self._synced_s = time.monotonic()
@@ -42,17 +40,8 @@ class BackgroundWriter:
             self._waiting_bytes += len(piece)
             self._changed.notify_all()
 
-    def sync(self) -> None:
-        """Wait until everything taken is durable. Raises OSError."""
-        with self._changed:
-            self._hurry = True
-            self._changed.notify_all()
-            self._changed.wait_for(lambda: self._failure or not (self._waiting or self._busy or self._unsafe))
-            self._hurry = False
-            self._raise_failure()
-
     def close(self) -> None:
-        """Write what is left and let go of the file. Raises OSError once it is let go of."""
+        """Make everything durable and let go of the file. Raises OSError once it is let go of."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -80,26 +69,21 @@ class BackgroundWriter:
         """Everything that waits; [] when it is only time to sync; None at the end."""
         with self._changed:
             due_s = max(0.0, self._synced_s + SYNC_S - time.monotonic()) if self._unsafe else None
-            self._changed.wait_for(lambda: self._waiting or self._closing or (self._hurry and self._unsafe), due_s)
+            self._changed.wait_for(lambda: self._waiting or self._closing, due_s)
             if self._closing and not self._waiting and not self._unsafe:
                 return None
             batch = list(self._waiting)
             self._waiting.clear()
             self._waiting_bytes = 0
-            self._busy = True
             self._changed.notify_all()
             return batch
 
     def _done(self, wrote: bool) -> None:
         """A batch is written: make it durable when that is due."""
         self._unsafe |= wrote
-        now_s = time.monotonic()
-        if self._unsafe and (self._hurry or self._closing or now_s >= self._synced_s + SYNC_S):
+        if self._unsafe and (self._closing or time.monotonic() >= self._synced_s + SYNC_S):
             os.fdatasync(self._file)
-            self._unsafe, self._synced_s = False, now_s
-        with self._changed:
-            self._busy = False
-            self._changed.notify_all()
+            self._unsafe, self._synced_s = False, time.monotonic()
 
 
 def _append(file: int, piece: bytes) -> None:
