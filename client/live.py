@@ -100,8 +100,6 @@ class LiveFeed:
             self._picture = Picture(said)
         elif self._picture is not None:  # else it was on its way when the last watcher left
             self._picture.take(said)
-            if isinstance(said, m.LiveEnded):
-                self._picture = None
         self._tell()
 
     def forget(self) -> None:
@@ -115,10 +113,11 @@ class LiveFeed:
 
     async def frames(self) -> AsyncIterator[LiveFrame]:
         """Frames of the sweep that runs, else of the next, as they change, up to its end. Raises what ends the feed."""
-        picture, shown = self._picture, -1
+        over = self._picture if self._picture and self._picture.ended else None
+        picture, shown = None, -1
         while True:
-            if picture is None:
-                picture = self._picture
+            if self._picture not in (picture, over) and not (picture and picture.ended):
+                picture, shown = self._picture, -1
             if picture is not None and picture.changes > shown:
                 shown, frame = picture.changes, picture.frame()
                 yield frame

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -203,7 +203,7 @@ class Session:
             news.end(self._ended)
         return news
 
-    async def live(self) -> AsyncIterator[LiveFrame]:
+    async def live(self) -> AsyncGenerator[LiveFrame, None]:
         """The sweep that runs, else the next one, as it comes in: `async for frame in session.live()`.
 
         Frames follow each other as fast as they are read; the last one says how the sweep ended. Watching costs the

@@ -75,6 +75,7 @@ class Live:
 
     def published(self, scan_id: str) -> None:
         """The sweep is a scan now."""
+        self._progress(1.0)
         self._end("published", scan=scan_id)
 
     def _start(self, header: SweepHeader) -> None:

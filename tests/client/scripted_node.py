@@ -171,7 +171,7 @@ class Line:
     socket: web.WebSocketResponse
     session: Session
 
-    async def say(self, *said: m.FromNode | Refinement) -> None:
+    async def say(self, *said: m.FromNode | Refinement | LiveColumns) -> None:
         for one in said:
             data = self.session.send(one)
             await (self.socket.send_str(data) if isinstance(data, str) else self.socket.send_bytes(data))

@@ -187,7 +187,7 @@ def test_a_viewer_that_missed_the_end_hears_it_before_the_next_start() -> None:
     viewer = Viewer(live)
     live.watch(SweepStarted(header()))
     viewer.look()
-    live.published("ab")
+    interrupt(live)
     live.watch(SweepStarted(header()))
     viewer.look()
     assert viewer.kinds() == [m.LiveStarted, m.LiveProgress, m.LiveEnded, m.LiveStarted, m.LiveProgress]
