@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 import time
@@ -22,6 +23,7 @@ from node.exhibits import Exhibits
 from node.identity import node_identity
 from node.library import About, Library
 from node.live import Live
+from node.notify import Notifier, keep_notified, status_text
 from node.serve import NodeServer
 from protocol import messages as m
 from protocol.grid import Grid
@@ -35,15 +37,20 @@ async def run_node(config: Config, ready: Callable[[str], None]) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
+    notifier = Notifier.from_environment(os.environ)
     async with AsyncExitStack() as stack:
-        url = await start_node(config, stack)
+        url, capture = await start_node(config, stack)
         ready(url)
+        notifier.ready(status_text(url, capture))
+        telling = asyncio.create_task(keep_notified(notifier, url, capture))
         await stop.wait()
+        telling.cancel()
+        notifier.stopping()
         log.info("stopping")
 
 
-async def start_node(config: Config, stack: AsyncExitStack) -> str:
-    """Bring up every part and leave its end to the stack. Returns the URL clients use."""
+async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Capture | None]:
+    """Bring up every part and leave its end to the stack. Returns the URL that clients use, and the scanner's owner."""
     folder = config.library.path
     library = await asyncio.to_thread(Library, folder, config.first_view.max_bytes)
     for problem in library.problems:
@@ -63,7 +70,7 @@ async def start_node(config: Config, stack: AsyncExitStack) -> str:
         stack.push_async_callback(asyncio.to_thread, capture.stop)
     if config.discovery.enabled:
         await stack.enter_async_context(Advertisement(info.name, info.id, host, port))
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}", capture
 
 
 def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | None, list[Callable[[str], object]]]:
