@@ -105,7 +105,7 @@ def restore(path: Path, folder: Path) -> Restored:
         try:
             scan_ids = _unpack(_TarReader(file), staged)
             for scan_id in scan_ids:
-                _check(staged / scan_id)
+                _check(staged / scan_id, "the backup is damaged")
             write_whole(staged / CHECKED, b"")
         except BaseException as error:
             shutil.rmtree(staged, ignore_errors=True)
@@ -126,8 +126,7 @@ def _pack(folder: Path, scan_ids: list[str], file: BinaryIO) -> None:
         _pack_bytes(archive, MARK, msgspec.json.encode(_Mark(FORMAT, len(scan_ids))) + b"\n", sums)
         for scan_id in scan_ids:
             scan = folder / scan_id
-            read_sound_grid(scan, read_record(scan).spec)
-            read_sidecar(scan)
+            _check(scan, "cannot back up")
             for name in BYTES_MAX:
                 if name != SIDECAR_FILE or (scan / name).exists():
                     _pack_file(archive, f"{scan_id}/{name}", scan / name, sums)
@@ -253,10 +252,10 @@ def _unpack_file(reader: _TarReader, path: Path, bytes_max: int) -> str:
     return digest.hexdigest()
 
 
-def _check(scan: Path) -> None:
+def _check(scan: Path, trouble: str) -> None:
     """Raises LibraryError unless a folder holds a sound scan."""
     try:
         read_sound_grid(scan, read_record(scan).spec)
         read_sidecar(scan)
     except LibraryError as error:
-        raise LibraryError(f"the backup is damaged: scan {scan.name}: {error}") from error
+        raise LibraryError(f"{trouble}: scan {scan.name[:40]}: {error}") from error

@@ -124,7 +124,7 @@ def move_in(folder: Path, staged: Path) -> list[str]:
 
 def _finish_restore(folder: Path, staged: Path) -> str:
     if (staged / CHECKED).exists():
-        return f"finished restoring a backup: {len(move_in(folder, staged))} scans"
+        return f"finished restoring a backup: its last {len(move_in(folder, staged))} scans"
     shutil.rmtree(staged)
     return f"removed {staged.name}: a backup that was never completely unpacked"
 
