@@ -1,0 +1,123 @@
+"""The daemon as its unit runs it: what systemd hears, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from client import NodeLost, connect
+from foveascan import PROGRAM, started
+
+STOP_S = 5.0  # REQUIREMENTS AT-36
+WATCHDOG_S = 8.0
+
+
+@contextmanager
+def notification_socket(path: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+        line.bind(str(path))
+        line.settimeout(20)
+        yield line
+
+
+def hear(line: socket.socket, start: str) -> dict[str, str]:
+    """The next notification that begins so, as its fields."""
+    while not (said := line.recv(4096).decode()).startswith(start):
+        pass
+    return dict(field.split("=", 1) for field in said.splitlines())
+
+
+def serve(folder: Path, *more: str) -> list[str]:
+    return ["serve", "--library", str(folder / "library"), "--listen", "127.0.0.1:0", "--insecure", "--json", *more]
+
+
+def deaf_client(url: str) -> socket.socket:
+    """A client that opens a stream and never reads what it is told."""
+    host, _, port = url.removeprefix("http://").rpartition(":")
+    line = socket.create_connection((host, int(port)), timeout=5)
+    upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+    key = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: foveascan.v1\r\n"
+    line.sendall(f"GET /v1/stream HTTP/1.1\r\nHost: {host}\r\n{upgrade}{key}\r\n".encode())
+    assert line.recv(12) == b"HTTP/1.1 101"
+    return line
+
+
+async def ready_to_sweep(url: str) -> None:
+    async with connect(url) as session:
+        while (await session.scanner())["phase"] != "ready":
+            await asyncio.sleep(0.05)
+
+
+def test_systemd_hears_ready_when_it_is_true_then_life_then_the_end(tmp_path: Path) -> None:
+    environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "n"), "WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))}
+    with notification_socket(tmp_path / "n") as line:
+        with subprocess.Popen([*PROGRAM, *serve(tmp_path)], env=environ, stdout=subprocess.DEVNULL) as node:
+            status = hear(line, "READY=1")["STATUS"]
+            url = status.removeprefix("Serving ").partition(",")[0]
+            with urllib.request.urlopen(f"{url}/healthz", timeout=5) as answer:
+                assert answer.status == 200
+            for _ in range(2):
+                hear(line, "WATCHDOG=1")
+            began_s = time.monotonic()
+            node.terminate()
+            assert hear(line, "STOPPING=1")
+            assert node.wait(STOP_S) == 0
+            assert time.monotonic() - began_s < STOP_S
+
+
+def test_a_node_that_cannot_listen_never_says_ready(tmp_path: Path) -> None:
+    environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "n")}
+    with notification_socket(tmp_path / "n") as line, socket.create_server(("127.0.0.1", 0)) as taken:
+        arguments = serve(tmp_path, "--listen", f"127.0.0.1:{taken.getsockname()[1]}")
+        failed = subprocess.run([*PROGRAM, *arguments], env=environ, capture_output=True, timeout=60)
+        assert failed.returncode == 1
+        line.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            line.recv(4096)
+
+
+async def test_sigterm_in_the_middle_of_a_sweep_tells_clients_and_publishes_nothing(tmp_path: Path) -> None:
+    simulate = ["simulate", "--path", str(tmp_path / "tty"), "--link-rate", "100000", "--json"]
+    with started(*simulate) as (_, link), started(*serve(tmp_path, "--scanner", link["path"])) as (node, ready):
+        await ready_to_sweep(ready["url"])
+        async with connect(ready["url"]) as session:
+            deaf = deaf_client(ready["url"])
+            await session.start_sweep()
+            began_s = 0.0
+            async for frame in session.live():
+                if frame.percent > 10 and not began_s:
+                    began_s = time.monotonic()
+                    node.terminate()
+            assert frame.ended == "interrupted"
+            with pytest.raises(NodeLost, match="the node is stopping"):
+                await anext(session.live())
+            assert await asyncio.to_thread(node.wait, STOP_S) == 0
+            assert time.monotonic() - began_s < STOP_S, time.monotonic() - began_s
+            deaf.close()
+    with started(*serve(tmp_path)) as (_, ready):
+        async with connect(ready["url"]) as session:
+            assert await session.scans() == []
+
+
+async def test_kill_9_and_a_new_start_let_clients_go_on(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    again = serve(tmp_path, "--listen", f"127.0.0.1:{port}")
+    with started(*again) as (node, ready):
+        async with connect(ready["url"]) as session:
+            node.kill()
+            with pytest.raises(NodeLost):
+                await anext(session.published())
+    with started(*again) as (_, restarted):
+        assert restarted["url"] == ready["url"]
+        async with connect(restarted["url"]) as session:
+            assert await session.scans() == []
