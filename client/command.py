@@ -1,4 +1,4 @@
-"""The subcommands `discover`, `scan` and `look`: a headless client."""
+"""The subcommands `discover`, `scan`, `export`, `import` and `look`: a headless client."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from client import scan_command
+from client import exchange_command, scan_command
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -20,13 +20,14 @@ CENTRE = (0.5, 0.5)
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Offer `discover`, `scan` and `look`."""
+    """Offer `discover`, `scan`, `export`, `import` and `look`."""
     finder = subparsers.add_parser("discover", help="list the nodes on this network")
     _add_common(finder)
     finder.add_argument("--name", help="stop at the node of this name or id")
     finder.set_defaults(run=run_discover)
 
     scan_command.add_subcommands(subparsers)
+    exchange_command.add_subcommands(subparsers)
 
     looker = subparsers.add_parser("look", help="open a scan and get detail where you look")
     _add_common(looker)
@@ -41,7 +42,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     looker.add_argument("--range-mm", type=_number, default=0.1, metavar="MM", help="range error to stop at (0.1)")
     looker.add_argument("--max-wait", type=_number, metavar="S", help="seconds a look may take")
     looker.add_argument("--max-bytes", type=int, metavar="N", help="bytes a look may take")
-    looker.add_argument("-o", "--output", metavar="FILE", help="write the model; the suffix is the format (.npz)")
+    looker.add_argument("-o", "--output", metavar="FILE", help="write the model; the suffix is the format (.glb ...)")
     looker.set_defaults(run=run_look)
 
 

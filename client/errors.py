@@ -3,8 +3,7 @@
 FoveascanError
 ├── NodeLost        no node there, or not any more
 ├── RequestRefused  the node understood, and said no
-├── HoldingsDiffer  node and client disagree on what the client has; the session states it anew
-└── ExportError     a model cannot be written
+└── HoldingsDiffer  node and client disagree on what the client has; the session states it anew
 """
 
 from protocol.errors import FoveascanError
@@ -25,7 +24,3 @@ class RequestRefused(FoveascanError):
 
 class HoldingsDiffer(FoveascanError):
     """A refinement was planned over other holdings than ours."""
-
-
-class ExportError(FoveascanError):
-    """A model cannot be written in the format asked for."""

@@ -97,7 +97,10 @@ class Model:
         return Grid(self.spec, self.range_steps, self.texture)
 
     def export(self, path: str | Path) -> None:
-        """Write the model to a file in the format its suffix names (.npz). Raises ExportError, OSError."""
+        """Write the model as it is now; the suffix is the format: .glb, .ply, .obj.zip, .stl or .npz.
+
+        Raises ExchangeError for any other suffix and where nothing is measured, OSError.
+        """
         write_grid(self.grid, path)
 
     def state(self) -> Statement:

@@ -18,12 +18,13 @@ async def ask(http: aiohttp.ClientSession, method: str, url: str) -> Any:
     """The JSON a node answers with. Raises RequestRefused, NodeLost, RemoteWireError."""
     try:
         async with http.request(method, url, timeout=TIMEOUT) as response:
-            return _reply(response.status, await _bounded_body(response))
+            return reply(response.status, await bounded_body(response))
     except (aiohttp.ClientError, OSError) as error:
         raise NodeLost(f"lost {url}: {error or 'no answer in time'}; try again once the node is back") from error
 
 
-async def _bounded_body(response: aiohttp.ClientResponse) -> bytes:
+async def bounded_body(response: aiohttp.ClientResponse) -> bytes:
+    """All a node sends, of a bounded length. Raises RemoteWireError when it goes on beyond that."""
     body = bytearray()
     async for chunk in response.content.iter_any():
         body += chunk
@@ -32,12 +33,13 @@ async def _bounded_body(response: aiohttp.ClientResponse) -> bytes:
     return bytes(body)
 
 
-def _reply(status: int, body: bytes) -> Any:
+def reply(status: int, body: bytes) -> Any:
+    """The JSON of an answer. Raises RequestRefused for a refusal, RemoteWireError for anything that is no JSON."""
     try:
-        reply = msgspec.json.decode(body)
-    except (msgspec.DecodeError, UnicodeError) as error:
-        raise RemoteWireError(f"HTTP {status} without a JSON body: {error}") from None
+        said = msgspec.json.decode(body)
+    except (msgspec.DecodeError, UnicodeError) as problem:
+        raise RemoteWireError(f"HTTP {status} without a JSON body: {problem}") from None
     if status >= 400:
-        said = reply if isinstance(reply, dict) else {}
-        raise RequestRefused(str(said.get("code", f"HTTP {status}")), str(said.get("message", "")))
-    return reply
+        error = said if isinstance(said, dict) else {}
+        raise RequestRefused(str(error.get("code", f"HTTP {status}")), str(error.get("message", "")))
+    return said

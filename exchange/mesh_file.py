@@ -63,7 +63,7 @@ def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | No
         raise ExchangeError(f"{path}: larger than {FILE_BYTES_MAX} bytes")
     if suffix in GLTF:
         _check_gltf(path)
-    parts = [_part(geometry, texture) for geometry in _load(path)]
+    parts = [_part(geometry, placed, texture) for geometry, placed in _load(path)]
     mesh = _joined(path, parts)
     up = placing.up or ("y" if suffix in GLTF else "z")
     unit_mm = placing.unit_mm or (MM_PER_M if suffix in GLTF else 1.0)
@@ -71,26 +71,30 @@ def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | No
     return Mesh(_on_axis(path, corners, placing.centred), mesh.image, mesh.uv, mesh.colours, mesh.images)
 
 
-def _load(path: Path) -> list[trimesh.Trimesh]:
-    """Every mesh of a file where its scene puts it."""
+def _load(path: Path) -> list[tuple[trimesh.Trimesh, FloatArray]]:
+    """Every mesh of a file, and the 4 x 4 matrix by which its scene places it."""
     try:
         scene = trimesh.load_scene(path, process=False)
-        found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh)]
+        nodes = [scene.graph[name] for name in scene.graph.nodes_geometry]
     except OSError:
         raise
     except Exception as problem:  # readers of a dozen formats raise whatever comes to their mind over bad bytes
         raise ExchangeError(f"{path}: no mesh we can read: {type(problem).__name__}: {problem}") from problem
-    faces = sum(len(geometry.faces) for geometry in found)
+    placed = [(scene.geometry[name], np.asarray(matrix, np.float64)) for matrix, name in nodes]
+    found = [(geometry, matrix) for geometry, matrix in placed if isinstance(geometry, trimesh.Trimesh)]
+    faces = sum(len(geometry.faces) for geometry, _ in found)
     if not 0 < faces <= FACES_MAX:
         raise ExchangeError(f"{path}: faces: {faces}, expected 1 to {FACES_MAX}")
     return found
 
 
-def _part(geometry: trimesh.Trimesh, texture: ImageArray | None) -> Mesh:
+def _part(geometry: trimesh.Trimesh, placed: FloatArray, texture: ImageArray | None) -> Mesh:
     faces = np.asarray(geometry.faces)
+    if not faces.size:
+        return _coloured(np.zeros((0, 3, 3)), None, None, None)
     if faces.min() < 0 or faces.max() >= len(geometry.vertices):
         raise ExchangeError("faces: a vertex that does not exist")
-    corners = np.asarray(geometry.vertices, np.float64)[faces]
+    corners = (np.asarray(geometry.vertices, np.float64) @ placed[:3, :3].T + placed[:3, 3])[faces]
     visual = geometry.visual
     uv = getattr(visual, "uv", None)
     image = texture if texture is not None else _image(visual)

@@ -73,7 +73,7 @@ class _Members:
     def __contains__(self, key: str) -> bool:
         return f"{key}.npy" in self._names
 
-    def array(self, key: str, dtype: str, dimensions: int) -> NDArray[Any]:
+    def array(self, key: str, dimensions: int, *kinds: type[Any]) -> NDArray[Any]:
         if key not in self:
             raise ExchangeError(f"{key}: missing")
         with self._archive.open(f"{key}.npy") as member:
@@ -81,8 +81,9 @@ class _Members:
                 shape, fortran, found = _header(member)  # type: ignore[arg-type]
             except ValueError as problem:
                 raise ExchangeError(f"{key}: {problem}") from None
-            if not np.issubdtype(found, dtype) or len(shape) != dimensions:
-                raise ExchangeError(f"{key}: expected {dimensions} dimensions of {dtype}, got {found}{list(shape)}")
+            if not issubclass(found.type, kinds) or len(shape) != dimensions:
+                expected = f"{dimensions} dimensions of {" or ".join(kind.__name__ for kind in kinds)}"
+                raise ExchangeError(f"{key}: expected {expected}, got {found}{list(shape)}")
             size_bytes = math.prod(shape) * found.itemsize
             if size_bytes > self._bytes_max:
                 raise ExchangeError(f"{key}: {size_bytes} bytes, at most {self._bytes_max}")
@@ -92,7 +93,7 @@ class _Members:
         return np.frombuffer(data, found).reshape(shape, order="F" if fortran else "C")
 
     def number(self, key: str) -> float:
-        value = float(self.array(key, "number", 0))
+        value = float(self.array(key, 0, np.floating, np.integer))
         if not math.isfinite(value):
             raise ExchangeError(f"{key}: must be finite, got {value}")
         return value
@@ -110,8 +111,8 @@ def _header(member: BinaryIO) -> tuple[Shape, bool, np.dtype[Any]]:
 def _read(members: _Members, texture: ImageArray | None) -> tuple[str, Grid]:
     if texture is None and "texture" not in members:
         raise ExchangeError("texture: missing; give its image with --texture")
-    depth = members.array("depth_u16", "uint16", 2).astype(np.uint16, copy=False)
-    texels: ImageArray = members.array("texture", "uint8", 3) if texture is None else texture
+    depth = members.array("depth_u16", 2, np.uint16).astype(np.uint16, copy=False)
+    texels: ImageArray = members.array("texture", 3, np.uint8) if texture is None else texture
     try:
         return _name(members), Grid(_spec(members, depth.shape, texels.shape), depth, texels)
     except ValueError as problem:
@@ -132,7 +133,7 @@ def _spec(members: _Members, depth: Shape, texture: Shape) -> GridSpec:
 def _name(members: _Members) -> str:
     if "name" not in members:
         return ""
-    name = str(members.array("name", "str", 0))
+    name = str(members.array("name", 0, np.str_))
     if len(name) > NAME_MAX:
         raise ExchangeError(f"name: {len(name)} characters, at most {NAME_MAX}")
     return name

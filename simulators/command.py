@@ -25,10 +25,13 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     simulate.add_argument("--link", choices=("pty",), default="pty", help="what the node opens (pty)")
     simulate.add_argument("--path", required=True, type=Path, help="symbolic link to create for the node to open")
     simulate.add_argument(
-        "--specimen", default="head", metavar="NAME|FILE", help="head, nutcracker, sphere, cylinder or .npz (head)"
+        "--specimen",
+        default="head",
+        metavar="NAME|FILE",
+        help="head, nutcracker, sphere, cylinder, or a .npz grid, mesh or Echo file (head)",
     )
-    simulate.add_argument("--texture", type=Path, metavar="IMAGE", help="texture of a .npz grid")
-    simulate.add_argument("--size", choices=("S", "M", "L"), default="S", help="size of a generated specimen (S)")
+    simulate.add_argument("--texture", type=Path, metavar="IMAGE", help="texture of a specimen from a file")
+    simulate.add_argument("--size", choices=("S", "M", "L"), default="S", help="of a generated specimen or a mesh (S)")
     simulate.add_argument("--seed", type=_whole(0, 2**32 - 1), default=0, help="of specimen and jitter (0)")
     simulate.add_argument(
         "--turn", type=_real(0.01, 3600), default=1.0, metavar="S", help="time of a turn, where the line allows (1)"
@@ -48,15 +51,17 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
 
 def run_simulate(args: argparse.Namespace) -> int:
     """Serve sweeps until SIGTERM or SIGINT."""
+    from exchange.native import write_native
+    from exchange.whole_file import whole_file
     from simulators.carriers import PtyPort, serve
-    from simulators.grid_file import write_truth
     from simulators.scanner import SimulatedScanner
     from simulators.specimen import make_specimen
     from simulators.turntable import Turntable
 
     specimen = make_specimen(args.specimen, args.size, args.texture, args.seed)
     if args.truth is not None:
-        write_truth(args.truth, specimen.name, specimen.grid)
+        with whole_file(args.truth) as file:
+            write_native(specimen.grid, file, specimen.name)
     table = Turntable(specimen, turn_s=args.turn, jitter_counts=args.jitter, seed=args.seed)
     baud = args.baud if args.link_rate is None else round(BITS_PER_BYTE * args.link_rate)
     with closing(PtyPort(args.path, baud)) as port, _stopped_by_signals(port) as stop:

@@ -14,10 +14,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from exchange.formats import MeshOptions, read_scan
 from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from simulators import shapes
-from simulators.grid_file import read_grid
 from simulators.head import head
 from simulators.nutcracker import nutcracker
 
@@ -73,26 +73,28 @@ class Specimen:
 def make_specimen(
     name_or_path: str | Path, size: str = "S", texture_path: str | Path | None = None, seed: int = 0
 ) -> Specimen:
-    """A generated specimen by its name, or a grid from a file.
+    """A generated specimen by its name, or what a file holds: a grid (.npz), an Echo file or a mesh.
 
-    size, seed : S, M or L, and what to draw from; for generated ones: a file has its own size.
+    size : S, M or L, of a generated specimen or of the grid a mesh is cast on; other files have their own.
+    seed : what a generated specimen is drawn from.
     texture_path : image of a file's texture (any format OpenCV reads); for files only.
-    Raises ConfigError for an unknown name, size or file format; OSError for a file that cannot be opened.
+    Raises ConfigError for an unknown name or size, ExchangeError for a file that is no scan, OSError for one that
+    cannot be opened.
     """
     if size not in SIZES:
         raise ConfigError(f"size: {size} is none of {', '.join(SIZES)}")
     generate = GENERATORS.get(str(name_or_path))
     if generate is None:
-        return _from_file(Path(name_or_path), None if texture_path is None else Path(texture_path))
+        return _from_file(Path(name_or_path), size, None if texture_path is None else Path(texture_path))
     if texture_path is not None:
-        raise ConfigError(f"texture: {name_or_path} brings its own; --texture goes with a .npz file")
+        raise ConfigError(f"texture: {name_or_path} brings its own; --texture goes with a file")
     return Specimen(str(name_or_path), generate(SIZES[size], seed))
 
 
-def _from_file(path: Path, texture_path: Path | None) -> Specimen:
-    if path.suffix != ".npz":
-        raise ConfigError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no .npz file")
-    return Specimen(*read_grid(path, texture_path))
+def _from_file(path: Path, size: str, texture_path: Path | None) -> Specimen:
+    if not path.suffix and not path.exists():
+        raise ConfigError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no file")
+    return Specimen(*read_scan(path, texture_path, MeshOptions(SIZES[size])))
 
 
 def _columns_about(angle_rad: float, theta0_rad: float, width: int) -> tuple[int, int, float]:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from exchange.formats import read_scan
 from node.library import About, Library, Scan
 from protocol.grid import VOID, Grid
-from simulators.grid_file import read_grid
 from simulators.specimen import GENERATORS, make_specimen
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -59,7 +59,7 @@ def load(specimen: str, size: str, texture: str | None = None) -> BenchScan:
     if specimen in GENERATORS:
         return BenchScan(specimen, size, make_specimen(specimen, size).grid)
     if specimen not in REAL:
-        name, grid = read_grid(Path(specimen), Path(texture) if texture else None)
+        name, grid = read_scan(Path(specimen), Path(texture) if texture else None)
         return BenchScan(name, "file", grid)
     if size not in SHAPES:
         raise Skipped(f"{specimen}: exists at {' and '.join(SHAPES)} only")
@@ -68,4 +68,4 @@ def load(specimen: str, size: str, texture: str | None = None) -> BenchScan:
     images = sorted(path.parent.glob(f"{specimen}_tex_{texels}.*"))
     if not (path.exists() and images):
         raise Skipped(f"{specimen}: not in {DATA.parent.name}/{DATA.name} beside this checkout")
-    return BenchScan(specimen, size, read_grid(path, images[0])[1])
+    return BenchScan(specimen, size, read_scan(path, images[0])[1])

@@ -13,7 +13,7 @@ from aiohttp import web
 
 from client import NodeLost, RequestRefused, command, discovery
 from client.discovery import NodeAddress
-from client.errors import ExportError
+from exchange.errors import ExchangeError
 from protocol import messages as m
 from protocol.errors import LocalWireError, ScannerFault
 from tests.client.scripted_node import Line, greet, serving_in_thread, show_and_answer, synthetic_grid
@@ -74,7 +74,7 @@ def test_look_prints_the_scan_and_each_update_and_writes_the_model(
     assert scan["first_view_bytes"] > 0
     assert (update["u"], update["v"], update["reason"], update["texture_db"]) == (0.4, 0.4, "complete", 100.0)
     with np.load(target) as file:
-        assert np.array_equal(file["range_steps"][16:32, 24:48], GRID.range_steps[16:32, 24:48])
+        assert np.array_equal(file["depth_u16"][16:32, 24:48], GRID.range_steps[16:32, 24:48])
 
 
 def test_look_is_readable_without_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,7 +99,7 @@ def test_look_asks_which_of_several_nodes(nodes: list[NodeAddress]) -> None:
 
 
 def test_look_refuses_a_format_it_cannot_write_before_it_connects() -> None:
-    with pytest.raises(ExportError, match=r"model\.xyz: cannot write \.xyz; use \.npz"):
+    with pytest.raises(ExchangeError, match=r"model\.xyz: cannot tell its format; end it in \.glb, "):
         run("look", "--node", "http://127.0.0.1:9", "-o", "model.xyz")
 
 

@@ -1,0 +1,80 @@
+"""Whole scans as files: fetched from a node, and sent to one."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import aiohttp
+
+from client.errors import NodeLost
+from client.rest import bounded_body, reply
+from exchange.formats import suffix_of
+from exchange.whole_file import whole_file
+from protocol.errors import RemoteWireError
+
+CHUNK_BYTES = 1 << 18
+TIMEOUT = aiohttp.ClientTimeout(total=None, sock_connect=10, sock_read=600)  # a node writes a file before it sends it
+
+Moved = Callable[[int, int | None], object]
+"""Told the bytes moved so far, and those in all where they are known."""
+
+
+async def fetch_scan(url: str, scan: str, path: str | Path, *, token: str | None = None, moved: Moved) -> int:
+    """Write a node's scan ("latest" or an id) to a file, in the format its suffix names. Returns its size in bytes.
+
+    Raises ExchangeError for a suffix we do not know, RequestRefused, NodeLost, RemoteWireError, OSError; then the
+    file is what it was before.
+    """
+    address = f"{url}/v1/scans/{scan}{suffix_of(path)}"
+    async with _request("GET", address, token) as response:
+        if response.status != 200:
+            reply(response.status, await bounded_body(response))
+            raise RemoteWireError(f"HTTP {response.status} without a file")
+        with whole_file(path) as file:
+            async for chunk in response.content.iter_chunked(CHUNK_BYTES):
+                file.write(chunk)
+                moved(file.tell(), response.content_length)
+            return file.tell()
+
+
+async def send_scan(url: str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> str:
+    """Add a native grid (.npz, open at its start) to a node's library. Returns the scan's id.
+
+    Raises RequestRefused, NodeLost, RemoteWireError; then the node has nothing of it.
+    """
+    size = file.seek(0, 2)
+    file.seek(0)
+
+    async def chunks() -> AsyncIterator[bytes]:
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk
+            moved(file.tell(), size)
+
+    headers = {"Content-Length": str(size), "Content-Type": "application/zip"}
+    async with _request("POST", f"{url}/v1/scans", token, data=chunks(), headers=headers) as response:
+        said = reply(response.status, await bounded_body(response))
+    if not isinstance(said, dict) or not isinstance(said.get("id"), str):
+        raise RemoteWireError(f"{url} took the scan and did not say its id")
+    return str(said["id"])
+
+
+@asynccontextmanager
+async def _request(
+    method: str,
+    url: str,
+    token: str | None,
+    data: AsyncIterator[bytes] | None = None,
+    headers: dict[str, str] | None = None,
+) -> AsyncIterator[aiohttp.ClientResponse]:
+    login = {"Authorization": f"Bearer {token}"} if token else {}
+    try:
+        async with (
+            aiohttp.ClientSession(timeout=TIMEOUT, headers=login) as http,
+            http.request(method, url, data=data, headers=headers) as response,
+        ):
+            yield response
+    except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
+        raise NodeLost(f"lost {url}: {error or 'no answer in time'}; try again once the node is back") from error

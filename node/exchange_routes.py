@@ -1,0 +1,153 @@
+"""Scans as files over HTTP: GET one in a format of the exchange, POST a native grid to add it to the library.
+
+A file is written whole before its first byte is sent, and received whole before it is read: in a nameless temporary
+file on the library's disk, which a crash cannot leave behind. So a half import is never seen, and neither direction
+holds more than a band or a chunk beside the scan itself. At most EXPORTS_MAX and one import at a time; a reader or
+sender that stalls for STALL_S loses its place.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import tempfile
+import time
+from collections.abc import Callable
+from typing import BinaryIO
+
+import msgspec
+from aiohttp import ClientError, web
+
+from exchange.errors import ExchangeError
+from exchange.formats import MEDIA_TYPES, writer_of
+from exchange.native import read_native
+from node.auth import require
+from node.exhibits import Exhibits
+from node.library import About, Scan
+from protocol.errors import LibraryError
+from protocol.grid import Grid
+
+CHUNK_BYTES = 1 << 18
+IMPORT_BYTES_MAX = 1 << 29
+ARRAY_BYTES_MAX = 1 << 28
+EXPORTS_MAX = 2
+STALL_S = 60.0
+FORMATS = "|".join(suffix.removeprefix(".").replace(".", r"\.") for suffix in MEDIA_TYPES)
+
+
+class ExchangeRoutes:
+    """The two routes. published : told the id of each scan that was imported."""
+
+    def __init__(self, exhibits: Exhibits, published: Callable[[str], object]) -> None:
+        self._exhibits = exhibits
+        self._published = published
+        self._exporting = asyncio.Semaphore(EXPORTS_MAX)
+        self._importing = asyncio.Semaphore(1)
+
+    def routes(self) -> list[web.RouteDef]:
+        """What to add to the application, before any route that takes /v1/scans/{anything}."""
+        return [
+            web.get(rf"/v1/scans/{{scan:[^./]+}}.{{format:{FORMATS}}}", self._export),
+            web.post("/v1/scans", self._import),
+        ]
+
+    async def _export(self, request: web.Request) -> web.StreamResponse:
+        _check_free(self._exporting)
+        async with self._exporting:
+            scan_id = self._exhibits.resolve(request.match_info["scan"])
+            suffix = f".{request.match_info['format']}"
+            scan = await asyncio.to_thread(self._exhibits.library.open, scan_id)
+            with self._temporary() as file:
+                await asyncio.to_thread(_write, scan, suffix, file)
+                return await _send(request, file, f"{scan_id}{suffix}", MEDIA_TYPES[suffix])
+
+    async def _import(self, request: web.Request) -> web.Response:
+        require(request, "operate")
+        _check_free(self._importing)
+        async with self._importing:
+            with self._temporary() as file:
+                await _receive(request, file)
+                name, grid = await asyncio.to_thread(_read, file)
+            scan = await self._keep(name, grid)
+        self._published(scan.id)
+        return web.Response(body=msgspec.json.encode({"id": scan.id}), content_type="application/json", status=201)
+
+    async def _keep(self, name: str, grid: Grid) -> Scan:
+        about = About(time.time(), "import", name)
+        try:
+            return await asyncio.to_thread(self._exhibits.library.add, grid, about)
+        except LibraryError as problem:
+            raise web.HTTPInsufficientStorage(text=str(problem)) from problem
+
+    def _temporary(self) -> BinaryIO:
+        return tempfile.TemporaryFile(dir=self._exhibits.library.folder)
+
+
+def _check_free(places: asyncio.Semaphore) -> None:
+    if places.locked():
+        raise web.HTTPServiceUnavailable(text="busy with other files: try again later")
+
+
+def _write(scan: Scan, suffix: str, file: BinaryIO) -> None:
+    try:
+        writer_of(suffix)(Grid(scan.spec, scan.range_steps, scan.texture), file)
+        file.flush()
+    except ExchangeError as problem:
+        raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
+    except OSError as problem:
+        raise _disk_trouble(problem) from problem
+
+
+async def _send(request: web.Request, file: BinaryIO, name: str, media_type: str) -> web.StreamResponse:
+    response = web.StreamResponse(headers={"Content-Disposition": f'attachment; filename="{name}"'})
+    response.content_type = media_type
+    response.content_length = file.tell()
+    await response.prepare(request)
+    file.seek(0)
+    while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
+        async with asyncio.timeout(STALL_S):
+            await response.write(chunk)
+    await response.write_eof()
+    return response
+
+
+async def _receive(request: web.Request, file: BinaryIO) -> None:
+    """The whole body into a file. Raises an HTTP error for one that is too long, stalls, or ends early."""
+    _check_length(request.content_length or 0)
+    received = 0
+    try:
+        while True:
+            async with asyncio.timeout(STALL_S):
+                chunk = await request.content.read(CHUNK_BYTES)
+            if not chunk:
+                break
+            received += len(chunk)
+            _check_length(received)
+            await asyncio.to_thread(file.write, chunk)
+    except TimeoutError:
+        raise web.HTTPRequestTimeout(text=f"nothing came for {STALL_S:g} s") from None
+    except (ClientError, web.RequestPayloadError) as problem:
+        raise web.HTTPBadRequest(text=f"the upload ended early: {problem}") from problem
+    except OSError as problem:
+        raise _disk_trouble(problem) from problem
+
+
+def _check_length(size_bytes: int) -> None:
+    if size_bytes > IMPORT_BYTES_MAX:
+        raise web.HTTPRequestEntityTooLarge(IMPORT_BYTES_MAX, size_bytes, text=f"at most {IMPORT_BYTES_MAX} bytes")
+
+
+def _read(file: BinaryIO) -> tuple[str, Grid]:
+    file.seek(0)
+    try:
+        return read_native(file, array_bytes_max=ARRAY_BYTES_MAX)
+    except ExchangeError as problem:
+        raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
+
+
+def _disk_trouble(problem: OSError) -> web.HTTPException:
+    if isinstance(problem, ConnectionError):
+        return web.HTTPBadRequest(text="the connection was lost")
+    if problem.errno == errno.ENOSPC:
+        return web.HTTPInsufficientStorage(text="the node's disk is full")
+    return web.HTTPInternalServerError(text=f"the node's disk: {problem.strerror}")
