@@ -82,7 +82,7 @@ class _Members:
             except ValueError as problem:
                 raise ExchangeError(f"{key}: {problem}") from None
             if not issubclass(found.type, kinds) or len(shape) != dimensions:
-                expected = f"{dimensions} dimensions of {" or ".join(kind.__name__ for kind in kinds)}"
+                expected = f"{dimensions} dimensions of {' or '.join(kind.__name__ for kind in kinds)}"
                 raise ExchangeError(f"{key}: expected {expected}, got {found}{list(shape)}")
             size_bytes = math.prod(shape) * found.itemsize
             if size_bytes > self._bytes_max:
