@@ -268,7 +268,8 @@ class Connection:
         def superseded() -> bool:
             return self._look is not None or self._running_look is not look
 
-        job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded)
+        model = self._exhibits.texture_model(bound.scan)
+        job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded, model)
         return await self._exhibits.work(job)
 
     async def _send_update(self, bound: _Bound, look: m.Look, update: Update, spent_s: float) -> None:

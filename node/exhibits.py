@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from node.first_view import FirstView, build_first_view
 from node.library import Library, Scan
+from node.texture_model import TextureModel
 from protocol.errors import LibraryError
 from protocol.messages import CodecName
 
 VIEWS_MAX = 8
+MODELS_MAX = 8
 T = TypeVar("T")
 
 
@@ -25,6 +28,9 @@ class Exhibits:
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="encode")
         self._views: OrderedDict[tuple[str, CodecName], asyncio.Future[tuple[Scan, FirstView]]] = OrderedDict()
+        self._closing = threading.Event()
+        self._surveyor = ThreadPoolExecutor(1, thread_name_prefix="survey")
+        self._models: OrderedDict[str, Future[TextureModel]] = OrderedDict()
 
     async def open(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]:
         """A scan ("latest" or an id) and its first view. Raises LibraryError when there is none such."""
@@ -37,10 +43,17 @@ class Exhibits:
                 self._views.popitem(last=False)
         self._views.move_to_end(key)
         try:
-            return await asyncio.shield(future)
+            scan, view = await asyncio.shield(future)
         except LibraryError:
             self._views.pop(key, None)
             raise
+        self._survey(scan)
+        return scan, view
+
+    def texture_model(self, scan: Scan) -> TextureModel | None:
+        """What the scan's texture takes and reaches; None until that is measured."""
+        model = self._models.get(scan.id)
+        return model.result() if model is not None and model.done() and model.exception() is None else None
 
     def resolve(self, scan_id: str) -> str:
         """The id that "latest" stands for; any other is returned as it is. Raises LibraryError when there is none."""
@@ -57,7 +70,17 @@ class Exhibits:
 
     def close(self) -> None:
         """Let running jobs end, start no more."""
+        self._closing.set()
+        self._surveyor.shutdown(cancel_futures=True)
         self._pool.shutdown(cancel_futures=True)
+
+    def _survey(self, scan: Scan) -> None:
+        """Have the scan's texture measured, one scan at a time, beside everything else."""
+        if scan.id not in self._models:
+            self._models[scan.id] = self._surveyor.submit(TextureModel, scan.texture, self._closing.is_set)
+            while len(self._models) > MODELS_MAX:
+                self._models.popitem(last=False)[1].cancel()
+        self._models.move_to_end(scan.id)
 
     def _build(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]:
         scan = self.library.open(scan_id)

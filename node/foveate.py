@@ -8,24 +8,50 @@ Source: Cheng, Basu, Pan 2003, Eq. (15), with REQUIREMENTS F-14 and F-14b.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
 
-from node.coded import Coded
+from node.coded import Coded, wire_overhead
 from node.library import Scan
-from node.quality import Point, QualitySearch
-from node.refine_range import choose_range, code_range, note_range
-from node.refine_texture import SPACINGS, choose_spacing, code_texture, coded_mse, db_of_mse, quality_bounds
+from node.quality import FILL, Point, QualitySearch
+from node.refine_range import (
+    QUANTUM_MAX,
+    choose_range,
+    code_range,
+    expected_range_bytes,
+    note_range,
+    select_range,
+)
+from node.refine_texture import (
+    CODECS,
+    SPACINGS,
+    choose_spacing,
+    code_texture,
+    coded_mse,
+    db_of_mse,
+    mse_of_db,
+    quality_bounds,
+)
 from node.state import ClientState
+from node.texture_model import Expected, TextureModel
 from protocol.grid import RANGE_BLOCK
-from protocol.lattice import Channel
+from protocol.lattice import Channel, Parameters
 from protocol.messages import CodecName, Look, RangeParameters, TextureParameters
 from protocol.region import Region, region_round
 
 REPLY_BYTES = 220  # the Updated message that ends an update, carrier included
+RANGE_OVERHEAD_BYTES = wire_overhead(Parameters(2, 0, 0, 1, 1)) + 64  # a void mask included
+TEXTURE_BYTES_MIN = 128  # for less, no texture is tried
+RANGE_MARGIN = 1.1  # expectations of range are a tenth off
+DOUBLINGS_MAX = 6
+NO_TEXTURE = 8.0  # doublings of error that an update without texture falls short by
+GENERIC_BYTES_PER_TEXEL = 0.04
+QUANTA_PER_SPACING = 6
 
 Reason = Literal["complete", "byte limit", "superseded"]
 
@@ -58,14 +84,16 @@ def plan_update(
     codec: CodecName,
     budget_bytes: int | None = None,
     superseded: Callable[[], bool] = lambda: False,
+    model: TextureModel | None = None,
 ) -> Update:
     """Plan the update that answers a look.
 
     codec : the texture codec for this client.   budget_bytes : what the update may take; None for no limit.
     superseded : asked between encodes; when true, what is planned so far is dropped.
+    model : what the scan's texture takes, where that is known by now.
     Raises LatticeError or CodecError where explicit parameters do not fit the scan.
     """
-    planner = _Planner(scan, state.copy(), look, codec, budget_bytes, superseded)
+    planner = _Planner(scan, state.copy(), look, codec, budget_bytes, superseded, model)
     try:
         planner.run()
     except _Superseded:
@@ -88,9 +116,10 @@ class _Planner:
         codec: CodecName,
         budget_bytes: int | None,
         superseded: Callable[[], bool],
+        model: TextureModel | None,
     ) -> None:
-        self._scan, self._state, self._look, self._codec = scan, state, look, codec
-        self._left = None if budget_bytes is None else budget_bytes - REPLY_BYTES
+        self._scan, self._state, self._look, self._codec, self._model = scan, state, look, codec, model
+        self._left = math.inf if budget_bytes is None else budget_bytes - REPLY_BYTES
         self._superseded = superseded
         self._coded: list[Coded] = []
         self._encodes = 0
@@ -99,6 +128,8 @@ class _Planner:
         s = scan.spec
         self._range_region = region_round(look.u, look.v, look.window, s.width, s.height)
         self._texture_region = region_round(look.u, look.v, look.window, s.texture_width, s.texture_height)
+        self._target_steps = look.range_mm / s.step_mm
+        self._target_mse = mse_of_db(look.texture_db)
 
     def run(self) -> None:
         """Choose, encode and note the refinements."""
@@ -107,8 +138,10 @@ class _Planner:
             self._take(self._code_range(explicit.range) if explicit.range else None)
             self._take(self._code_texture(explicit.texture) if explicit.texture else None)
             return
-        self._refine_range()
-        self._refine_texture()
+        wanted, range_bytes = self._divide()
+        texture = self._search_texture(self._left - range_bytes)
+        self._take(self._fill_range(wanted, self._left - (texture.wire_bytes if texture else 0)))
+        self._take(texture)
 
     def update(self) -> Update:
         """What came of it."""
@@ -116,43 +149,128 @@ class _Planner:
         error_mm = _error_in(self._state, self._range_region) * self._scan.spec.step_mm
         return Update(tuple(self._coded), self._state, reason, error_mm, self._texture_db, self._encodes)
 
-    def _refine_range(self) -> None:
-        target_steps = self._look.range_mm / self._scan.spec.step_mm
-        choice = choose_range(self._scan, self._state, self._range_region, target_steps)
-        for attempt, parameters in enumerate(_coarser_range(choice.parameters, self._scan.spec.width)):
-            coded = self._code_range(parameters)
-            if coded is None or self._fits(coded):
-                self._limited |= attempt > 0
-                self._take(coded)
-                return
-        self._limited = True
+    # -- how much for range, how much for texture ------------------------------------------------------------------
 
-    def _refine_texture(self) -> None:
-        look = self._look
-        finest = choose_spacing(self._scan, self._state, self._texture_region, look.texture_db, self._codec)
-        found = None
+    def _divide(self) -> tuple[RangeParameters, float]:
+        """The range parameters to use and the bytes to keep for them.
+
+        Without a limit, or where both qualities fit it: the cheapest that reach the quality. Else the pair that falls
+        short the least, a doubled range error counting as much as 6 dB of texture.
+        """
+        choice = choose_range(self._scan, self._state, self._range_region, self._target_steps)
+        range_bytes = self._range_bytes(choice.parameters)
+        if math.isinf(self._left):
+            return choice.parameters, range_bytes
+        best, least = (choice.parameters, range_bytes), self._shortfall(0, self._left - range_bytes)
+        doubled = 0
+        while least > doubled and doubled < DOUBLINGS_MAX:
+            doubled += 1
+            target = max(self._target_steps, 0.5) * 2**doubled
+            choice = choose_range(self._scan, self._state, self._range_region, target)
+            range_bytes = self._range_bytes(choice.parameters)
+            shortfall = self._shortfall(doubled, self._left - range_bytes)
+            if shortfall < least:
+                best, least = (choice.parameters, range_bytes), shortfall
+                self._limited = True
+        return best
+
+    def _range_bytes(self, wanted: RangeParameters) -> float:
+        """What range is expected to take on the wire; 0 when the client holds it already."""
+        found = select_range(self._state, self._range_region, wanted)
+        if found is None:
+            return 0.0
+        return RANGE_OVERHEAD_BYTES + RANGE_MARGIN * expected_range_bytes(self._scan, found[0], found[2])
+
+    def _shortfall(self, doubled: int, texture_left: float) -> float:
+        """How far an update falls short, in doublings of error, when texture is left so many bytes."""
+        if texture_left <= 0:
+            return doubled + NO_TEXTURE
+        expected = self._expected()
+        mse = expected.mse(max(expected.quality_for_bytes(texture_left), 0))
+        return float(doubled + max(math.log2(mse / self._target_mse) / 2, 0))
+
+    def _expected(self) -> Expected:
+        """What texture takes and reaches in the window."""
+        if self._model is None:
+            area = self._texture_region.width * self._texture_region.height
+            return Expected.generic(self._target_mse, max(area * GENERIC_BYTES_PER_TEXEL, 64.0))
+        return self._model.expect(self._texture_region, CODECS[self._codec])
+
+    # -- texture ---------------------------------------------------------------------------------------------------
+
+    def _search_texture(self, limit_bytes: float) -> Coded | None:
+        """The cheapest refinement within limit_bytes that reaches the quality, else the best one that fits."""
+        if limit_bytes < TEXTURE_BYTES_MIN:
+            self._limited = True
+            return None
+        finest = choose_spacing(self._scan, self._state, self._texture_region, self._look.texture_db, self._codec)
         for p in (spacing for spacing in reversed(SPACINGS) if spacing >= finest):
-            found = self._search_quality(p)
-            if found is not None or not self._limited:
-                break
-        if found is not None:
-            self._texture_db = found.db
-            self._take(found.coded)
+            search = QualitySearch(self._target_mse, limit_bytes, self._expected(), *quality_bounds(self._codec))
+            wanted_any = self._try_qualities(search, p)
+            self._limited |= search.limited
+            found = search.best()
+            if found is not None:
+                self._texture_db = db_of_mse(found.mse)
+                return found.coded
+            if not wanted_any:
+                return None
+        return None
 
-    def _search_quality(self, p: float) -> Point | None:
-        """The cheapest fitting refinement at spacing p that reaches the quality asked for, else the best that fits."""
-        target = self._look.texture_db
-        search = QualitySearch(target, *quality_bounds(self._codec))
+    def _try_qualities(self, search: QualitySearch, p: float) -> bool:
+        """Feed a search; False when the client holds all of this already."""
         while (quality := search.next_quality()) is not None:
             coded = self._code_texture(TextureParameters(p=p, quality=quality, codec=self._codec))
             if coded is None:
-                return None
-            if self._fits(coded):
-                search.measured(Point(quality, db_of_mse(coded_mse(self._scan, coded, self._texture_region)), coded))
+                return False
+            if search.fits(coded):
+                mse = coded_mse(self._scan, coded, self._texture_region)
+                search.measured(Point(quality, mse, coded))
             else:
-                self._limited = True
-                search.too_large(quality, coded.wire_bytes / max(self._left or 0, 1))
-        return search.best()
+                search.too_large(quality, coded.wire_bytes)
+            self._learn(p, quality, coded)
+        return True
+
+    def _learn(self, p: float, quality: int, coded: Coded) -> None:
+        if self._model is not None and p == 1:
+            share = coded.selection.adopted.mean()
+            self._model.learn(CODECS[self._codec], share * self._expected().size_bytes(quality), len(coded.payload))
+
+    # -- range -----------------------------------------------------------------------------------------------------
+
+    def _fill_range(self, wanted: RangeParameters, limit_bytes: float) -> Coded | None:
+        """Range as wanted; where the limit binds, with the smallest quantum that fits it."""
+        if not (self._limited and math.isfinite(limit_bytes)):
+            return self._first_that_fits(wanted, limit_bytes)
+        wanted = self._affordable(wanted, limit_bytes)
+        coded = self._first_that_fits(wanted, limit_bytes)
+        if coded is None or coded.quality == 1 or coded.wire_bytes >= FILL * limit_bytes:
+            return coded
+        expected = max(self._range_bytes(msgspec.structs.replace(wanted, quantum=coded.quality)), 1.0)
+        wanted = self._affordable(wanted, (FILL + 1) / 2 * limit_bytes * expected / coded.wire_bytes)
+        finer = self._code_range(wanted)
+        return finer if finer is not None and coded.wire_bytes < finer.wire_bytes <= limit_bytes else coded
+
+    def _first_that_fits(self, wanted: RangeParameters, limit_bytes: float) -> Coded | None:
+        for parameters in _ever_coarser(wanted, self._scan.spec.width):
+            coded = self._code_range(parameters)
+            if coded is None or coded.wire_bytes <= limit_bytes:
+                return coded
+            self._limited = True
+        return None
+
+    def _affordable(self, wanted: RangeParameters, limit_bytes: float) -> RangeParameters:
+        """The same spacing with the smallest quantum expected to fit."""
+        low, high = 1, max(wanted.quantum, 2)
+        while high - low > low // 16:
+            middle = (low + high) // 2
+            quantised = msgspec.structs.replace(wanted, quantum=middle)
+            if self._range_bytes(quantised) <= limit_bytes:
+                high = middle
+            else:
+                low = middle + 1
+        return msgspec.structs.replace(wanted, quantum=high)
+
+    # -- one refinement --------------------------------------------------------------------------------------------
 
     def _code_range(self, wanted: RangeParameters) -> Coded | None:
         self._count_encode()
@@ -167,17 +285,14 @@ class _Planner:
             raise _Superseded
         self._encodes += 1
 
-    def _fits(self, coded: Coded) -> bool:
-        return self._left is None or coded.wire_bytes <= self._left
-
     def _take(self, coded: Coded | None) -> None:
+        """Add a refinement to the update, if it fits what is left."""
         if coded is None:
             return
-        if not self._fits(coded):
+        if coded.wire_bytes > self._left:
             self._limited = True
             return
-        if self._left is not None:
-            self._left -= coded.wire_bytes
+        self._left -= coded.wire_bytes
         if coded.channel is Channel.RANGE:
             note_range(self._scan, self._state, coded)
         else:
@@ -185,12 +300,14 @@ class _Planner:
         self._coded.append(coded)
 
 
-def _coarser_range(first: RangeParameters, width: int) -> Iterator[RangeParameters]:
-    """The parameters chosen, then ever cheaper ones, for a budget that is too small for them."""
-    yield first
-    for p in (1, 2, 4, 8):
-        if p >= first.p and width % p == 0:
-            yield RangeParameters(p=p, quantum=max(first.quantum, 2) * (4 if p == first.p else 1), s=None)
+def _ever_coarser(first: RangeParameters, width: int) -> Iterator[RangeParameters]:
+    """The parameters chosen, then ever cheaper ones, for when they take more than was expected."""
+    quantum = first.quantum
+    for p in (p for p in (1, 2, 4, 8) if p >= first.p and width % p == 0):
+        for _ in range(QUANTA_PER_SPACING):
+            yield msgspec.structs.replace(first, p=p, quantum=min(quantum, QUANTUM_MAX))
+            quantum += max(quantum // 6, 1)
+        quantum *= 2
 
 
 def _error_in(state: ClientState, region: Region) -> float:

@@ -1,4 +1,4 @@
-"""Searching a texture quality in few encodes: aim by what has been measured, never repeat a try."""
+"""Searching a texture quality in few encodes: aim by what is expected, correct by what is measured."""
 
 from __future__ import annotations
 
@@ -6,74 +6,89 @@ import math
 from dataclasses import dataclass
 
 from node.coded import Coded
+from node.texture_model import Expected
 
-FIRST_QUALITY = 40
-DB_PER_QUALITY = 0.35  # what a step of quality is worth near the qualities in use, until two measurements tell
-BYTES_PER_DOUBLING = 8  # steps of quality that double the bytes
-MARGIN_DB = 0.1  # aimed above the target, so that the next try reaches it
-OVERSHOOT_DB = 0.4  # a result so little above the target is not worth another encode
-TRIES = 3  # tries spent on saving bytes; only to reach the target are there more
+MARGIN = 0.98  # of the squared error allowed: what is aimed at
+OVERSHOOT_DB = 0.45  # a result so little above the target is not worth another encode: a step of quality is 0.35 dB
+FILL = 0.95  # of the bytes there are: less is worth one more encode
+TRIES = 2  # tries spent on saving or filling bytes; only to reach the target or to fit are there more
 TRIES_MAX = 8
+TRIES_MAX_LIMITED = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """One try: what a quality gave."""
+    """One try that fitted: what a quality left and took."""
 
     quality: int
-    db: float
+    mse: float
     coded: Coded
 
 
 class QualitySearch:
-    """Looks for the lowest quality whose result has at least target_db, or the highest that is not too large."""
+    """Looks for the lowest quality whose squared error is at most target_mse, within limit_bytes on the wire.
 
-    def __init__(self, target_db: float, lowest: int, highest: int) -> None:
-        self._target = target_db
+    expected : what qualities take and reach, by the scan's model.  lowest, highest : the codec's qualities.
+    """
+
+    def __init__(
+        self, target_mse: float, limit_bytes: float, expected: Expected, lowest: int, highest: int
+    ) -> None:
+        self._target = target_mse
+        self._limit = limit_bytes
+        self._expected = expected
         self._lowest, self._highest = lowest, highest
         self._points: list[Point] = []
         self._tried: set[int] = set()
-        self._next: int | None = min(max(FIRST_QUALITY, lowest), highest)
+        self.limited = False
+        self._next: int | None = None
+        self._aim(1.0, 1.0)
 
     def next_quality(self) -> int | None:
         """What to try now; None when the search is over."""
-        if self._next is None or self._next in self._tried or len(self._tried) >= TRIES_MAX:
+        most = TRIES_MAX_LIMITED if self.limited and not self._points else TRIES_MAX
+        if self._next is None or self._next in self._tried or len(self._tried) >= most:
             return None
         self._tried.add(self._next)
         return self._next
 
+    def fits(self, coded: Coded) -> bool:
+        """Whether a try is within the bytes there are."""
+        return coded.wire_bytes <= self._limit
+
     def measured(self, point: Point) -> None:
         """A try fitted and was measured."""
         self._points.append(point)
-        reached = point.db >= self._target
-        if reached and (point.db - self._target <= OVERSHOOT_DB or len(self._tried) >= TRIES):
+        reached = point.mse <= self._target
+        spared = 10 * math.log10(self._target / max(point.mse, 1e-9)) if reached else 0.0
+        filled = point.coded.wire_bytes >= FILL * self._limit
+        done = spared <= OVERSHOOT_DB if reached else filled and self.limited
+        if done or ((reached or self.limited) and len(self._tried) >= TRIES):
             self._next = None
             return
-        step = (self._target + MARGIN_DB - point.db) / self._slope()
-        self._next = self._bounded(point.quality + (math.ceil(step) if step > 0 else -math.floor(-step)))
+        worse = point.mse / self._expected.mse(point.quality)
+        self._aim(worse, point.coded.wire_bytes / self._expected.size_bytes(point.quality))
+        if self._next in self._tried:
+            self._next = None if reached or self.limited else min(point.quality + 1, self._highest)
 
-    def too_large(self, quality: int, ratio: float) -> None:
-        """A try took `ratio` times the bytes there are; nothing at or above its quality fits."""
+    def too_large(self, quality: int, wire_bytes: int) -> None:
+        """A try took more than there is; nothing at or above its quality fits."""
         self._highest = quality - 1
+        self.limited = True
+        self._aim(1.0, wire_bytes / self._expected.size_bytes(quality))
         if self._highest < self._lowest:
             self._next = None
-            return
-        self._next = self._bounded(quality - max(math.ceil(BYTES_PER_DOUBLING * math.log2(max(ratio, 1))), 1))
 
     def best(self) -> Point | None:
         """The cheapest try that reached the target, else the one that came nearest; None when none fitted."""
-        reached = [point for point in self._points if point.db >= self._target]
+        reached = [point for point in self._points if point.mse <= self._target]
         if reached:
             return min(reached, key=lambda point: point.coded.wire_bytes)
-        return max(self._points, key=lambda point: point.db, default=None)
+        return min(self._points, key=lambda point: point.mse, default=None)
 
-    def _slope(self) -> float:
-        """Decibels a step of quality, from the last two tries."""
-        if len(self._points) < 2:
-            return DB_PER_QUALITY
-        a, b = self._points[-2:]
-        slope = (b.db - a.db) / (b.quality - a.quality)
-        return min(max(slope, DB_PER_QUALITY / 4), DB_PER_QUALITY * 4)
-
-    def _bounded(self, quality: int) -> int:
-        return min(max(quality, self._lowest), self._highest)
+    def _aim(self, worse: float, larger: float) -> None:
+        """Choose the next quality, given how far the expectation was off: factors on squared error and bytes."""
+        wanted = self._expected.quality_for_mse(MARGIN * self._target / worse)
+        affordable = self._expected.quality_for_bytes(self._limit / larger) if math.isfinite(self._limit) else wanted
+        self.limited |= affordable < wanted
+        self._next = min(max(min(wanted, affordable), self._lowest), self._highest)

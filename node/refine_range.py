@@ -16,7 +16,7 @@ from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
 from protocol.codec_lift import encode_and_decode, survey
-from protocol.grid import VOID
+from protocol.grid import VOID, BoolArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
@@ -63,13 +63,10 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
     Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
     Raises LatticeError for a spacing that does not fit the scan.
     """
-    held = state.holdings.channels[Channel.RANGE]
-    lattice = build_lattice(held.shape, range_lattice(region, wanted))
-    quantum = min(wanted.quantum, _best_held(held, lattice))
-    found = select(lattice, held, range_rank(quantum))
+    found = select_range(state, region, wanted)
     if found is None:
         return None
-    selection, adopted = found
+    selection, adopted, quantum = found
     void = void_cells(scan, selection)
     samples, seen = range_samples(scan, selection)
     payload, decoded = encode_and_decode(samples, quantum, seen)
@@ -77,6 +74,23 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
     patch[void] = VOID
     mask = encode_mask(void)
     return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, mask, patch)
+
+
+def select_range(
+    state: ClientState, region: Region, wanted: RangeParameters
+) -> tuple[Selection, BoolArray, int] | None:
+    """What code_range would carry: the selection, the adopted blocks of its lattice, the quantum; None: nothing."""
+    held = state.holdings.channels[Channel.RANGE]
+    lattice = build_lattice(held.shape, range_lattice(region, wanted))
+    quantum = min(wanted.quantum, _best_held(held, lattice))
+    found = select(lattice, held, range_rank(quantum))
+    return (*found, quantum) if found else None
+
+
+def expected_range_bytes(scan: Scan, selection: Selection, quantum: int) -> float:
+    """About how many bytes a selection's payload takes."""
+    samples, seen = range_samples(scan, selection)
+    return survey(samples, quantum, seen)[1]
 
 
 def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:

@@ -20,7 +20,7 @@ from protocol.reconstruct import Selection, select, texture_patch
 from protocol.region import Region
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
-SPACINGS = (8, 6, 4, 3, 2, 1.5, 1)
+SPACINGS = (8, 4, 2, 1)
 SKIRT_S = 1.0
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 

@@ -1,0 +1,141 @@
+"""What a scan's texture costs and how good it gets, place by place, at every quality: measured once for each scan.
+
+The whole texture is coded at a few qualities, tile by tile, when a scan is opened. From then on the first guess at a
+quality is nearly always the right one, so that an update is encoded once. Bytes of a tile and of a patch differ a
+little (a patch is larger); how much is learned from every update that is sent.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from protocol.codec import TextureCodec, decode_texture, encode_texture
+from protocol.grid import FloatArray, ImageArray
+from protocol.region import Region
+
+QUALITIES = (6, 20, 34, 48, 62)
+TILE = 256
+CELL = 16
+MSE_MIN = 1e-3
+FIRST_QUALITY = 38
+LOG_MSE_SLOPE = 0.08  # of a step of quality, on typical skin
+LOG_BYTES_SLOPE = 0.07
+TILE_OVERHEAD_BYTES = 18  # of a code stream whatever its size: a patch has it once
+BIAS_WEIGHT = 0.3
+JPEG_BIAS = 1.6  # what a JPEG of equal quality takes, until an update tells
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What a region's texture is expected to take and to reach. (one value per quality tried)"""
+
+    log_mse: FloatArray
+    log_bytes: FloatArray
+
+    def mse(self, quality: float) -> float:
+        """Squared error per value at a quality."""
+        return float(np.exp(np.interp(quality, QUALITIES, self.log_mse)))
+
+    def size_bytes(self, quality: float) -> float:
+        """Payload at a quality."""
+        return float(np.exp(_extended(quality, self.log_bytes)))
+
+    @classmethod
+    def generic(cls, target_mse: float, size_bytes: float) -> Expected:
+        """Where nothing is known of a scan: the target at FIRST_QUALITY for size_bytes, usual slopes round it."""
+        steps = np.array(QUALITIES, np.float64) - FIRST_QUALITY
+        return cls(np.log(target_mse) - LOG_MSE_SLOPE * steps, np.log(size_bytes) + LOG_BYTES_SLOPE * steps)
+
+    def quality_for_mse(self, mse: float) -> int:
+        """The lowest quality that should leave no more than this error."""
+        falling = np.minimum.accumulate(self.log_mse)
+        return int(np.ceil(np.interp(-np.log(max(mse, MSE_MIN)), -falling, QUALITIES)))
+
+    def quality_for_bytes(self, size_bytes: float) -> int:
+        """The highest quality that should take no more than this."""
+        rising = np.maximum.accumulate(self.log_bytes)
+        wanted = np.log(max(size_bytes, 1.0))
+        slope = (rising[-1] - rising[-2]) / (QUALITIES[-1] - QUALITIES[-2])
+        beyond = max(wanted - rising[-1], 0) / slope if slope > 0 else 0
+        return int(np.floor(np.interp(wanted, rising, QUALITIES) + beyond))
+
+
+class TextureModel:
+    """Expected bytes and error of any region of one scan's texture, at spacing 1. Safe to use from several threads.
+
+    texture : (Ht, Wt, 3) uint8 RGB; coded whole, once, in the calling thread.
+    unwanted : asked between tiles; when true, the work is dropped and CancelledError raised.
+    """
+
+    def __init__(self, texture: ImageArray, unwanted: Callable[[], bool] = lambda: False) -> None:
+        self._shape = texture.shape[:2]
+        rows, columns = (-(-size // TILE) for size in self._shape)
+        self._bytes = np.empty((len(QUALITIES), rows, columns))
+        cells = tuple(-(-size // CELL) for size in self._shape)
+        self._mse = np.empty((len(QUALITIES), *cells), np.float32)
+        self._bias = {TextureCodec.HTJ2K: 1.0, TextureCodec.JPEG: JPEG_BIAS}
+        self._lock = threading.Lock()
+        for row in range(rows):
+            for column in range(columns):
+                if unwanted():
+                    raise CancelledError
+                self._measure(texture, row, column)
+
+    def expect(self, region: Region, codec: TextureCodec) -> Expected:
+        """What the blocks that a region touches will take and reach."""
+        left, top, wide, high = region.blocks(CELL)
+        columns = np.arange(left, left + wide) % self._mse.shape[2]
+        mse = self._mse[:, top : top + high][:, :, columns].mean(axis=(1, 2), dtype=np.float64)
+        tiles = self._share_of_tiles(left * CELL, top * CELL, wide * CELL, high * CELL)
+        size_bytes = (self._bytes * tiles).sum(axis=(1, 2)) * self._bias[codec]
+        return Expected(np.log(np.maximum(mse, MSE_MIN)), np.log(np.maximum(size_bytes, 1.0)))
+
+    def learn(self, codec: TextureCodec, expected_bytes: float, actual_bytes: int) -> None:
+        """Take note of what a patch really took."""
+        if expected_bytes > 0 and actual_bytes > 0:
+            with self._lock:
+                ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
+                self._bias[codec] *= ratio**BIAS_WEIGHT
+
+    def _measure(self, texture: ImageArray, row: int, column: int) -> None:
+        """Code one tile at every quality."""
+        tile = np.ascontiguousarray(texture[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE])
+        height, width = tile.shape[:2]
+        cells = -(-width // CELL), -(-height // CELL)
+        y, x = row * TILE // CELL, column * TILE // CELL
+        for index, quality in enumerate(QUALITIES):
+            payload = encode_texture(tile, TextureCodec.HTJ2K, quality)
+            missed = cv2.absdiff(tile, decode_texture(payload, TextureCodec.HTJ2K, quality, (height, width)))
+            squared = cv2.resize(cv2.multiply(missed, missed, dtype=cv2.CV_32F), cells, interpolation=cv2.INTER_AREA)
+            self._bytes[index, row, column] = max(len(payload) - TILE_OVERHEAD_BYTES, 1)
+            self._mse[index, y : y + cells[1], x : x + cells[0]] = squared.reshape(cells[1], cells[0], 3).mean(axis=2)
+
+    def _share_of_tiles(self, left: int, top: int, width: int, height: int) -> FloatArray:
+        """How much of each tile a rectangle covers, 0..1, cyclic in x."""
+        rows = _overlap(top, height, self._bytes.shape[1], self._shape[0])
+        turn = self._shape[1]
+        columns = _overlap(left, min(width, turn - left), self._bytes.shape[2], turn)
+        if left + width > turn:
+            columns = columns + _overlap(0, left + width - turn, self._bytes.shape[2], turn)
+        return np.asarray(np.multiply.outer(rows, columns))
+
+
+def _overlap(start: int, length: int, tiles: int, size: int) -> FloatArray:
+    """Share of each tile of an axis inside start..start + length."""
+    begin = TILE * np.arange(tiles)
+    end = np.minimum(begin + TILE, size)
+    inside = np.minimum(end, start + length) - np.maximum(begin, start)
+    return np.asarray(np.maximum(inside, 0) / (end - begin))
+
+
+def _extended(quality: float, values: FloatArray) -> float:
+    """Linear interpolation over QUALITIES, the last slope kept beyond them."""
+    slope = (values[-1] - values[-2]) / (QUALITIES[-1] - QUALITIES[-2])
+    beyond = max(quality - QUALITIES[-1], 0)
+    return float(np.interp(quality, QUALITIES, values) + beyond * slope)
