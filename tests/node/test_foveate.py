@@ -1,0 +1,202 @@
+"""Planned updates, applied as a client would: what they reach, what they cost, what they leave alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from client.model import Model
+from node.first_view import FirstView, build_first_view
+from node.foveate import REPLY_BYTES, Update, plan_update
+from node.library import Scan
+from node.state import ClientState
+from node.texture_model import TextureModel
+from protocol import messages as m
+from protocol.grid import VOID
+from protocol.lattice import Channel
+from protocol.messages import Look, LookParameters, RangeParameters, TextureParameters
+from protocol.refinement import Refinement
+from protocol.region import region_round
+from tests.node.scans import keep, make_grid
+
+CLICKS = [(0.1, 0.5), (0.62, 0.3), (0.99, 0.02), (0.4, 0.98)]
+places = st.floats(0, 0.999)
+EXACT = LookParameters(RangeParameters(1, 1), TextureParameters(1, 255))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return keep(make_grid(), tmp_path_factory.mktemp("library"))
+
+
+@pytest.fixture(scope="module")
+def view(scan: Scan) -> FirstView:
+    return build_first_view(scan, "htj2k", 32768)
+
+
+@pytest.fixture(scope="module")
+def model_of_texture(scan: Scan) -> TextureModel:
+    return TextureModel(scan.texture)
+
+
+class Viewer:
+    """A client's model fed with planned updates, beside what the node believes of it."""
+
+    def __init__(self, scan: Scan, view: FirstView) -> None:
+        self.scan = scan
+        self.model = Model(view.info)
+        self.state: ClientState = view.state.copy()
+        for data in view.refinements(1):
+            self.model.apply(Refinement.from_bytes(data))
+        self.seq = 2
+
+    def take(self, update: Update) -> int:
+        """Apply an update as it travels; its bytes on the wire."""
+        size = 0
+        for coded in update.coded:
+            data = coded.refinement(1, self.seq, 1).to_bytes()
+            self.model.apply(Refinement.from_bytes(data))
+            self.seq += 1
+            size += len(data)
+        self.state = update.state
+        assert self.model.holdings.digest() == self.state.holdings.digest()
+        return size
+
+    def range_error_mm(self, look: Look) -> float:
+        s = self.scan.spec
+        region = region_round(look.u, look.v, look.window, s.width, s.height)
+        grids = self.model.range_steps, self.scan.range_steps
+        held, true = (steps[region.rows][:, region.columns].astype(int) for steps in grids)
+        np.testing.assert_array_equal(held == VOID, true == VOID)
+        error = np.abs(held - true)[true != VOID]
+        return float(np.percentile(error, 99, method="higher")) * s.step_mm if error.size else 0.0
+
+    def texture_db(self, look: Look) -> float:
+        s = self.scan.spec
+        region = region_round(look.u, look.v, look.window, s.texture_width, s.texture_height)
+        held, true = (a[region.rows][:, region.columns].astype(float) for a in (self.model.texture, self.scan.texture))
+        return float(10 * np.log10(255**2 / max(np.mean((held - true) ** 2), 1e-9)))
+
+
+@pytest.mark.parametrize("codec", ["htj2k", "jpeg"])
+@pytest.mark.parametrize(("u", "v"), CLICKS)
+def test_reaches_the_quality_asked_for(scan: Scan, view: FirstView, codec: m.CodecName, u: float, v: float) -> None:
+    viewer = Viewer(scan, view)
+    look = Look(1, u, v, texture_db=34, range_mm=0.05)
+    update = plan_update(scan, viewer.state, look, codec)
+    viewer.take(update)
+    assert update.reason == "complete"
+    assert viewer.range_error_mm(look) <= look.range_mm
+    assert viewer.texture_db(look) >= look.texture_db
+    assert update.texture_db == pytest.approx(viewer.texture_db(look), abs=0.01)
+
+
+def test_says_the_largest_error_left_in_the_window(scan: Scan, view: FirstView) -> None:
+    viewer = Viewer(scan, view)
+    look = Look(1, 0.62, 0.3)
+    update = plan_update(scan, viewer.state, look, "htj2k")
+    viewer.take(update)
+    s = scan.spec
+    region = region_round(look.u, look.v, look.window, s.width, s.height)
+    held, true = (a[region.rows][:, region.columns].astype(int) for a in (viewer.model.range_steps, scan.range_steps))
+    assert update.error_max_mm is not None
+    assert update.error_max_mm >= np.abs(held - true).max() * s.step_mm - 1e-9
+
+
+@settings(max_examples=40, deadline=None)
+@given(places, places, st.integers(0, 9000), st.sampled_from(["htj2k", "jpeg"]), st.booleans())
+def test_never_a_byte_over_the_budget(
+    scan: Scan, view: FirstView, model_of_texture: TextureModel, u: float, v: float, budget: int, codec: m.CodecName,
+    known: bool,
+) -> None:  # fmt: skip
+    viewer = Viewer(scan, view)
+    model = model_of_texture if known else None
+    update = plan_update(scan, viewer.state, Look(1, u, v), codec, budget, model=model)
+    if update.coded:
+        assert viewer.take(update) + REPLY_BYTES <= budget
+    else:
+        assert update.reason == "byte limit"
+
+
+def test_more_bytes_never_make_it_worse(scan: Scan, view: FirstView, model_of_texture: TextureModel) -> None:
+    look = Look(1, 0.62, 0.3, texture_db=45, range_mm=0.01)
+    reached = []
+    for budget in (1200, 2500, 5000, 10000, 20000):
+        viewer = Viewer(scan, view)
+        viewer.take(plan_update(scan, viewer.state, look, "htj2k", budget, model=model_of_texture))
+        reached.append((viewer.texture_db(look), -viewer.range_error_mm(look)))
+    for worse, better in zip(reached, reached[1:], strict=False):
+        assert better[0] >= worse[0] - 0.5
+        assert better[1] >= worse[1] - 0.02
+
+
+def test_the_same_look_twice_sends_nothing(scan: Scan, view: FirstView) -> None:
+    viewer = Viewer(scan, view)
+    look = Look(1, 0.3, 0.4, parameters=EXACT)
+    viewer.take(plan_update(scan, viewer.state, look, "htj2k"))
+    again = plan_update(scan, viewer.state, look, "htj2k")
+    assert again.coded == ()
+    assert again.reason == "complete"
+
+
+def test_looks_all_over_end_with_the_exact_scan(scan: Scan, view: FirstView) -> None:
+    viewer = Viewer(scan, view)
+    for u in np.arange(0.05, 1, 0.1):
+        for v in np.arange(0.05, 1, 0.1):
+            viewer.take(plan_update(scan, viewer.state, Look(1, float(u), float(v)), "htj2k"))
+            viewer.take(plan_update(scan, viewer.state, Look(1, float(u), float(v), parameters=EXACT), "htj2k"))
+    np.testing.assert_array_equal(viewer.model.range_steps, scan.range_steps)
+    np.testing.assert_array_equal(viewer.model.texture, scan.texture)
+    assert not viewer.state.error.any()
+
+
+def test_a_superseded_plan_is_dropped(scan: Scan, view: FirstView) -> None:
+    update = plan_update(scan, view.state, Look(1, 0.5, 0.5), "htj2k", None, lambda: True)
+    assert (update.reason, update.coded) == ("superseded", ())
+    assert update.state is view.state
+
+
+def test_planning_leaves_the_state_it_was_given(scan: Scan, view: FirstView) -> None:
+    before = view.state.copy()
+    plan_update(scan, view.state, Look(1, 0.5, 0.5), "htj2k")
+    assert view.state.holdings.digest() == before.holdings.digest()
+    np.testing.assert_array_equal(view.state.error, before.error)
+
+
+def test_few_encodes_once_the_texture_is_known(scan: Scan, view: FirstView, model_of_texture: TextureModel) -> None:
+    encodes = [
+        plan_update(scan, view.state, Look(1, u, v), "htj2k", model=model_of_texture).encodes for u, v in CLICKS
+    ]
+    assert np.mean(encodes) <= 3
+    assert max(encodes) <= 4
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (16, 1), (9, 7), (64, 3)])
+def test_odd_scans_are_served(tmp_path: Path, shape: tuple[int, int]) -> None:
+    width, height = shape
+    grid = make_grid(width, height, texels=2, voids=False)
+    scan = keep(grid, tmp_path)
+    viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
+    viewer.take(plan_update(scan, viewer.state, Look(1, 0.5, 0.5), "htj2k"))
+
+
+def test_a_scan_that_is_all_void_is_served(tmp_path: Path) -> None:
+    grid = make_grid(64, 32, voids=False)
+    void = type(grid)(grid.spec, np.zeros_like(grid.range_steps), grid.texture)
+    scan = keep(void, tmp_path)
+    viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
+    viewer.take(plan_update(scan, viewer.state, Look(1, 0.5, 0.5), "htj2k"))
+    assert not viewer.model.range_steps.any()
+
+
+def test_first_view_fits_and_is_the_same_for_the_node(scan: Scan) -> None:
+    codecs: tuple[m.CodecName, ...] = "htj2k", "jpeg"
+    for codec in codecs:
+        view = build_first_view(scan, codec, 32768)
+        assert sum(len(part) for part in view.refinements(0)) <= 32768
+        state = Viewer(scan, view).state
+        assert state.holdings.channels[Channel.RANGE].level.min() == state.shapes[Channel.RANGE].coarse_level
