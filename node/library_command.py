@@ -1,0 +1,202 @@
+"""`foveascan library`: the scans in a folder, looked at and looked after without a node.
+
+Looking (list, show, verify, backup) also works while a node runs; changing (rename, delete, restore) does not: the node
+has the library to itself then, and its HTTP interface is the way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from protocol.errors import LibraryError
+
+if TYPE_CHECKING:
+    from node.library import Library, ScanSummary
+
+SCAN_HELP = "the id, the beginning of one, or latest"
+
+
+def add_library_command(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Offer `library` and what it can do."""
+    library = subparsers.add_parser("library", help="list, show, rename, delete, verify, back up and restore scans")
+    actions = library.add_subparsers(title="actions", metavar="ACTION", required=True)
+    _add(actions, "list", run_list, "the scans, newest first, and whatever else lies there")
+    _add(actions, "show", run_show, "a scan and what is said of it").add_argument("scan", help=SCAN_HELP)
+    rename = _add(actions, "rename", run_rename, "call a scan something else")
+    rename.add_argument("scan", help=SCAN_HELP)
+    rename.add_argument("name", help="its new name, at most 200 characters")
+    delete = _add(actions, "delete", run_delete, "delete a scan for good")
+    delete.add_argument("scan", help=SCAN_HELP)
+    delete.add_argument("--yes", action="store_true", help="do not ask")
+    verify = _add(actions, "verify", run_verify, "read every sample; exit status 1 when anything is wrong")
+    verify.add_argument("scan", nargs="*", help=f"only these: {SCAN_HELP}")
+    backup = _add(actions, "backup", run_backup, "write scans into one new file, a plain tar")
+    backup.add_argument("file", type=Path, help="the file to write; it must not exist")
+    backup.add_argument("scan", nargs="*", help=f"only these: {SCAN_HELP}")
+    restore = _add(actions, "restore", run_restore, "take in the scans of a backup: all or none")
+    restore.add_argument("file", type=Path, help="a file that `backup` wrote")
+
+
+def _add(
+    actions: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    text: str,
+) -> argparse.ArgumentParser:
+    action = actions.add_parser(name, help=text)
+    action.add_argument("--config", type=Path, metavar="FILE", help="the node's settings (TOML)")
+    action.add_argument("--library", metavar="DIR", help="folder the scans are kept in; wins over the settings")
+    action.add_argument("--json", action="store_true", help="print one JSON object")
+    action.set_defaults(run=run)
+    return action
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print every scan and every problem."""
+    from node.library import survey
+
+    known, problems = survey(_folder(args))
+    scans = sorted(known.values(), key=lambda scan: -scan.sequence)
+    said = {"scans": [_as_json(scan) for scan in scans], "problems": [[p.name, p.reason] for p in problems]}
+    troubles = [f"{problem.name}: {problem.reason}; left alone" for problem in problems]
+    return _tell(args, said, "\n".join([*(_line(scan) for scan in scans), *troubles]) or "no scans")
+
+
+def run_show(args: argparse.Namespace) -> int:
+    """Print a scan, what is said of it, and who said it."""
+    import msgspec
+
+    from node.library import survey
+    from node.sidecar import read_sidecar
+
+    folder = _folder(args)
+    scan_id = _resolve(folder, args.scan)
+    scan = _as_json(survey(folder)[0][scan_id])
+    said = {**scan, "sidecar": msgspec.to_builtins(read_sidecar(folder / scan_id))}
+    return _tell(args, said, json.dumps(said, indent=2, ensure_ascii=False))
+
+
+def run_rename(args: argparse.Namespace) -> int:
+    """Give a scan another name."""
+    folder = _folder(args)
+    scan_id = _resolve(folder, args.scan)
+    with _opened(folder) as library:
+        try:
+            library.rename(scan_id, args.name, getpass.getuser())
+        except ValueError as problem:
+            raise LibraryError(f"name: {problem}") from problem
+    return _tell(args, {"id": scan_id, "name": args.name}, f"{scan_id[:12]} is called {args.name} now")
+
+
+def run_delete(args: argparse.Namespace) -> int:
+    """Delete a scan, after asking."""
+    folder = _folder(args)
+    scan_id = _resolve(folder, args.scan)
+    if not args.yes and not _confirmed(f"Delete scan {scan_id} for good?"):
+        return 1
+    with _opened(folder) as library:
+        library.delete(scan_id)
+    return _tell(args, {"deleted": scan_id}, f"deleted {scan_id}")
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """Check scans; 1 when one is damaged or something else is wrong with the library."""
+    from tqdm import tqdm
+
+    from node.library import survey, verify
+
+    folder = _folder(args)
+    known, others = survey(folder)
+    ids = [_resolve(folder, name) for name in args.scan] or sorted(known)
+    checked = tqdm(verify(folder, ids), "verify", len(ids), disable=None, leave=False, unit="scan")
+    problems = [problem for _, problem in checked if problem is not None]
+    if not args.scan:
+        problems += others
+    said = {"checked": len(ids), "problems": [[problem.name, problem.reason] for problem in problems]}
+    lines = [f"{problem.name}: {problem.reason}" for problem in problems]
+    _tell(args, said, "\n".join([*lines, f"{len(ids)} scans checked, {len(problems)} problems"]))
+    return 1 if problems else 0
+
+
+def run_backup(args: argparse.Namespace) -> int:
+    """Write a backup."""
+    from node.archive import backup
+    from node.library import survey
+
+    folder = _folder(args)
+    ids = list(dict.fromkeys(_resolve(folder, name) for name in args.scan)) or sorted(survey(folder)[0])
+    backup(folder, ids, args.file)
+    size_bytes = args.file.stat().st_size
+    said = {"file": str(args.file), "scans": len(ids), "bytes": size_bytes}
+    return _tell(args, said, f"{len(ids)} scans, {size_bytes} bytes in {args.file}")
+
+
+def run_restore(args: argparse.Namespace) -> int:
+    """Take a backup in."""
+    with _opened(_folder(args)) as library:
+        restored = library.restore(args.file)
+    said = {"added": list(restored.added), "kept": list(restored.kept)}
+    text = f"{len(restored.added)} scans restored, {len(restored.kept)} were here already and stay as they were"
+    return _tell(args, said, text)
+
+
+def _folder(args: argparse.Namespace) -> Path:
+    from node.config import load_config
+
+    return load_config(args.config, {"library.folder": args.library}).library.path
+
+
+def _resolve(folder: Path, text: str) -> str:
+    """The scan that somebody means. Raises LibraryError unless it is exactly one."""
+    from node.library import survey
+
+    known, _ = survey(folder)
+    if text == "latest" and known:
+        return max(known.values(), key=lambda scan: (scan.sequence, scan.id)).id
+    found = [scan_id for scan_id in known if text and scan_id.startswith(text)]
+    if len(found) != 1:
+        raise LibraryError(f"{'several scans begin' if found else 'no scan begins'} with {text[:40]!r}")
+    return found[0]
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[Library]:
+    """The library, locked; what a crash had left there is told."""
+    from node.library import Library
+
+    with closing(Library(folder)) as library:
+        for found in library.found:
+            print(f"foveascan: {found}", file=sys.stderr)
+        yield library
+
+
+def _line(scan: ScanSummary) -> str:
+    s = scan.spec
+    made = datetime.fromtimestamp(scan.about.created_unix_s).isoformat(" ", "minutes")
+    shape = f"{s.width} x {s.height} + {s.texture_width} x {s.texture_height}"
+    return f"{scan.id[:12]}  {made}  {shape}  {scan.about.name}".rstrip()
+
+
+def _as_json(scan: ScanSummary) -> dict[str, object]:
+    return asdict(scan)
+
+
+def _confirmed(question: str) -> bool:
+    """Whether the person at the terminal says yes. Raises LibraryError where nobody can be asked."""
+    if not sys.stdin.isatty():
+        raise LibraryError("nobody can be asked here: say --yes")
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+def _tell(args: argparse.Namespace, said: Mapping[str, object], text: str) -> int:
+    print(json.dumps(said) if args.json else text)
+    return 0

@@ -1,0 +1,202 @@
+"""The library over HTTP: what is said of scans, deleting and checking them, and the sweeps that were interrupted.
+
+    GET    /v1/scans/{scan}/sidecar     what is said of it, with its history; ETag is the revision
+    PATCH  /v1/scans/{scan}/sidecar     change some of it (also its name); If-Match: "revision" guards against others
+    POST   /v1/scans/{scan}/verify      read every sample and compare with the id
+    DELETE /v1/scans/{scan}
+    GET    /v1/sweeps                   interrupted sweeps, oldest first
+    POST   /v1/sweeps/{sweep}/resume    go on with one, if the scanner agrees
+    GET    /v1/sweeps/{sweep}.npz       what there is of it (node.partial)
+    DELETE /v1/sweeps/{sweep}
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import BinaryIO
+
+import msgspec
+from aiohttp import web
+
+from node.auth import ROLE, require
+from node.capture import Capture
+from node.durable import NoRoom
+from node.journal import Interrupted
+from node.library import Library, verify
+from node.partial import write_partial
+from node.sidecar import CHANGE_BYTES_MAX, Conflict, Sidecar, decode_changes
+from protocol.errors import LibraryError
+
+CHUNK_BYTES = 1 << 18
+
+
+def who_asks(request: web.Request) -> str:
+    """How the history calls whoever asks."""
+    return f"{request[ROLE]} at {request.remote}"
+
+
+class LibraryRoutes:
+    """The routes above.
+
+    deleted : told the id of each scan that was deleted, in the event loop.  who : how the history calls who asks.
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        capture: Capture | None,
+        deleted: Callable[[str], object] = lambda scan_id: None,
+        who: Callable[[web.Request], str] = who_asks,
+    ) -> None:
+        self._library = library
+        self._capture = capture
+        self._deleted = deleted
+        self._who = who
+
+    def routes(self) -> list[web.RouteDef]:
+        """What to add to the application."""
+        return [
+            web.get("/v1/scans/{scan}/sidecar", self._sidecar),
+            web.patch("/v1/scans/{scan}/sidecar", self._annotate),
+            web.post("/v1/scans/{scan}/verify", self._verify),
+            web.delete("/v1/scans/{scan}", self._delete),
+            web.get("/v1/sweeps", self._sweeps),
+            web.post("/v1/sweeps/{sweep}/resume", self._resume),
+            web.get("/v1/sweeps/{sweep:[0-9a-f]+}.npz", self._export_sweep),
+            web.delete("/v1/sweeps/{sweep}", self._delete_sweep),
+        ]
+
+    # -- scans -----------------------------------------------------------------------------------------------------
+
+    async def _sidecar(self, request: web.Request) -> web.Response:
+        scan_id = self._known(request)
+        with _explained():
+            return _said(await asyncio.to_thread(self._library.sidecar, scan_id))
+
+    async def _annotate(self, request: web.Request) -> web.Response:
+        require(request, "operate")
+        scan_id, revision = self._known(request), _revision(request)
+        with _explained():
+            changes = decode_changes(await request.content.read(CHANGE_BYTES_MAX + 1))
+            by = self._who(request)[:100]
+            return _said(await asyncio.to_thread(self._library.annotate, scan_id, changes, by, revision))
+
+    async def _verify(self, request: web.Request) -> web.Response:
+        require(request, "operate")
+        scan_id = self._known(request)
+        ((_, problem),) = await asyncio.to_thread(lambda: list(verify(self._library.folder, [scan_id])))
+        return _json({"id": scan_id, "sound": problem is None, "reason": problem.reason if problem else ""})
+
+    async def _delete(self, request: web.Request) -> web.Response:
+        require(request, "admin")
+        scan_id = self._known(request)
+        with _explained():
+            await asyncio.to_thread(self._library.delete, scan_id)
+        self._deleted(scan_id)
+        return web.Response(status=204)
+
+    def _known(self, request: web.Request) -> str:
+        """The scan that is asked for. Raises 404."""
+        scan_id: str = request.match_info["scan"]
+        try:
+            return self._library.summary(scan_id).id
+        except LibraryError as error:
+            raise web.HTTPNotFound(text=str(error)) from error
+
+    # -- sweeps ----------------------------------------------------------------------------------------------------
+
+    async def _sweeps(self, request: web.Request) -> web.Response:
+        return _json([_summary(sweep) for sweep in self._library.sweeps.interrupted()])
+
+    async def _resume(self, request: web.Request) -> web.Response:
+        require(request, "operate")
+        sweep = self._interrupted(request)
+        if self._capture is None:
+            raise web.HTTPConflict(text="this node has no scanner: start it with --scanner PATH")
+        if not self._capture.request_resume(sweep.id):
+            raise web.HTTPConflict(text="a sweep is running already")
+        return _json(_summary(sweep), status=202)
+
+    async def _delete_sweep(self, request: web.Request) -> web.Response:
+        require(request, "admin")
+        sweep = self._interrupted(request)
+        with _explained():
+            await asyncio.to_thread(self._library.sweeps.remove, sweep.id)
+        return web.Response(status=204)
+
+    async def _export_sweep(self, request: web.Request) -> web.StreamResponse:
+        sweep = self._interrupted(request)
+        with tempfile.TemporaryFile(dir=self._library.folder) as file:  # nameless: a crash leaves nothing
+            with _explained():
+                await asyncio.to_thread(self._write, sweep, file)
+            size_bytes = file.tell()
+            file.seek(0)
+            response = web.StreamResponse()
+            response.content_type = "application/octet-stream"
+            response.content_length = size_bytes
+            response.headers["Content-Disposition"] = f'attachment; filename="interrupted-{sweep.id}.npz"'
+            await response.prepare(request)
+            while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
+                await response.write(chunk)
+            await response.write_eof()
+            return response
+
+    def _write(self, sweep: Interrupted, file: BinaryIO) -> None:
+        write_partial(sweep, self._library.sweeps.columns(sweep.id), file)
+
+    def _interrupted(self, request: web.Request) -> Interrupted:
+        """The sweep that is asked for. Raises 404."""
+        try:
+            return self._library.sweeps.get(request.match_info["sweep"])
+        except LibraryError as error:
+            raise web.HTTPNotFound(text=str(error)) from error
+
+
+@contextmanager
+def _explained() -> Iterator[None]:
+    """What a library cannot do, in the terms of HTTP."""
+    try:
+        yield
+    except ValueError as error:
+        raise web.HTTPBadRequest(text=str(error)) from error
+    except Conflict as error:
+        raise web.HTTPPreconditionFailed(text=str(error)) from error
+    except NoRoom as error:
+        raise web.HTTPInsufficientStorage(text=str(error)) from error
+    except LibraryError as error:
+        raise web.HTTPInternalServerError(text=str(error)) from error
+
+
+def _revision(request: web.Request) -> int | None:
+    """The revision a change is meant for. Raises 400."""
+    tag = request.headers.get("If-Match", "*")
+    if tag == "*":
+        return None
+    match = re.fullmatch('"([0-9]{1,9})"', tag)
+    if match is None:
+        raise web.HTTPBadRequest(text='If-Match: expected a revision such as "3"')
+    return int(match[1])
+
+
+def _said(sidecar: Sidecar) -> web.Response:
+    response = _json(sidecar)
+    response.headers["ETag"] = f'"{sidecar.revision}"'
+    return response
+
+
+def _summary(sweep: Interrupted) -> dict[str, object]:
+    s = sweep.header.spec
+    return {
+        "id": sweep.id, "started": sweep.started_unix_s, "ended": sweep.ended_unix_s, "why": sweep.why,
+        "held": sweep.held, "expected": sweep.expected, "complete": sweep.is_complete,
+        "damagedBytes": sweep.damaged_bytes, "sizeBytes": sweep.size_bytes, "scanner": sweep.info.serial_number,
+        "width": s.width, "height": s.height, "textureWidth": s.texture_width, "textureHeight": s.texture_height,
+    }  # fmt: skip
+
+
+def _json(value: object, status: int = 200) -> web.Response:
+    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
