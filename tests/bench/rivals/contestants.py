@@ -1,0 +1,60 @@
+"""Every rival by its name: what it sends for a click, verified. Range and texture are chosen each for itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+
+from tests.bench.cache import Cache
+from tests.bench.rivals import draco_range, htj2k_texture, jpeg_texture, jpeg_whole, jpip, range_tiles
+from tests.bench.rivals.offer import Offer, reply, straight
+from tests.bench.scans import BenchScan, Click
+from tests.bench.target import Target, Window
+
+Part = Callable[[BenchScan, Window, Cache], Offer]
+
+PARTS: Mapping[str, Part] = {
+    "draco_full": draco_range.full_offer,
+    "draco_tiles": lambda scan, window, _: draco_range.tiles_offer(scan, window),
+    "range_tiles": lambda scan, window, _: range_tiles.range_offer(scan, window),
+    "jpip_range": lambda *all: jpip.range_offer(*all, jpip.AS_COARSE_AS_OURS["range"]),
+    "jpip_range_large": lambda *all: jpip.range_offer(*all, jpip.AS_LARGE_AS_OURS["range"]),
+    "jpeg_full": jpeg_whole.texture_offer,
+    "progressive_jpeg": jpeg_whole.progressive_offer,
+    "jpeg_tiles": lambda scan, window, _: jpeg_texture.texture_offer(scan, window),
+    "htj2k_tiles": lambda scan, window, _: htj2k_texture.texture_offer(scan, window),
+    "jpip_texture": lambda *all: jpip.texture_offer(*all, jpip.AS_COARSE_AS_OURS["texture"]),
+    "jpip_texture_large": lambda *all: jpip.texture_offer(*all, jpip.AS_LARGE_AS_OURS["texture"]),
+}
+SOURCES = {
+    "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles", "jpip_range": "jpip",
+    "jpip_range_large": "jpip", "jpeg_full": "jpeg_whole", "progressive_jpeg": "jpeg_whole",
+    "jpeg_tiles": "jpeg_texture", "htj2k_tiles": "htj2k_texture", "jpip_texture": "jpip", "jpip_texture_large": "jpip",
+}  # fmt: skip
+RIVALS: Mapping[str, tuple[str, str]] = {
+    "full Draco + JPEG": ("draco_full", "jpeg_full"),
+    "Draco + JPEG tiles": ("draco_tiles", "jpeg_tiles"),
+    "JPEG tile pyramid": ("range_tiles", "jpeg_tiles"),
+    "HTJ2K tile pyramid": ("range_tiles", "htj2k_tiles"),
+    "JPIP": ("jpip_range", "jpip_texture"),
+    "JPIP, 32 KiB first view": ("jpip_range_large", "jpip_texture_large"),
+    "progressive JPEG": ("range_tiles", "progressive_jpeg"),
+}
+SMALL = ("JPEG tile pyramid",)  # for a smoke run
+
+
+def bytes_for(rival: str, scan: BenchScan, click: Click, target: Target, cache: Cache) -> Offer:
+    """What a rival sends for a click. Raises Unreachable, or Skipped where it cannot run here."""
+    range_part, texture_part = RIVALS[rival]
+    return reply() + part(range_part, scan, click, target, cache) + part(texture_part, scan, click, target, cache)
+
+
+def part(name: str, scan: BenchScan, click: Click, target: Target, cache: Cache) -> Offer:
+    """One channel of a rival, from the cache where it is known."""
+
+    def make() -> dict[str, object]:
+        ready, place = straight(scan, click)
+        return asdict(PARTS[name](ready, Window.round(ready.grid, place, target), cache))
+
+    made = cache.value(f"rivals.{SOURCES[name]}", f"{name} {scan.key} {click} {target}", make)
+    return Offer(int(made["size_bytes"]), str(made["how"]))
