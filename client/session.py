@@ -154,6 +154,8 @@ class Session:
         max_wait_s: float | None = None,
         max_bytes: int | None = None,
         fill: bool = False,
+        alpha: float | None = None,
+        scale: float | None = None,
         profile: Literal["default"] = "default",
         parameters: m.LookParameters | Mapping[str, Any] | None = None,
     ) -> Update:
@@ -161,6 +163,7 @@ class Session:
 
         window : share of the area.      texture_db, range_mm : stop at this quality in it, or at a budget of
         max_wait_s or max_bytes, whichever comes first; fill : spend what is left of it on the periphery.
+        alpha : how fast detail falls off outside the window; scale : the window as a share of each axis instead.
         parameters : explicit sampling instead of the node's choice, as LookParameters or as the mapping of its JSON.
         A newer look supersedes an older one, which then returns early with reason "superseded".
         Raises LocalWireError for values out of bounds, RequestRefused, NodeLost, RemoteWireError.
@@ -178,6 +181,8 @@ class Session:
                 max_wait_s,
                 max_bytes,
                 fill,
+                alpha,
+                scale,
                 profile,
                 parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
             )

@@ -20,13 +20,14 @@ from node.auth import Auth
 from node.exhibits import Exhibits
 from node.foveate import Update, plan_update
 from node.library import Scan
-from node.live import Live, LiveSaid, Place
+from node.live import Live, Place
 from node.rate import RateControl
 from node.state import ClientState
 from protocol import messages as m
 from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
 from protocol.holdings import ChannelHoldings
 from protocol.lattice import Channel
+from protocol.live import LiveColumns
 from protocol.session import Phase, Role, Session
 
 log = logging.getLogger(__name__)
@@ -34,6 +35,7 @@ log = logging.getLogger(__name__)
 OPENS_MAX = 4
 HELLO_S = 10.0
 ACK_S = 60.0
+QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
 CLOSE_PROTOCOL_ERROR = 1002
 
 
@@ -269,7 +271,8 @@ class Connection:
             return self._look is not None or self._running_look is not look
 
         model = self._exhibits.texture_model(bound.scan)
-        job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded, model)
+        quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
+        job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded, model, quick)
         return await self._exhibits.work(job)
 
     async def _send_update(self, bound: _Bound, look: m.Look, update: Update, spent_s: float) -> None:
@@ -295,20 +298,16 @@ class Connection:
             self._live_news.clear()
             while (place := self._place) is not None and (news := self._live.next(place)):
                 for said in news:
-                    if self._session.phase is Phase.READY:  # else we have said goodbye meanwhile
-                        await self._send_live(said)
+                    await self._send(said)
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
     def _begin_timing(self) -> None:
         self._sent_bytes, self._sent_s = 0, time.monotonic()
 
-    async def _send(self, message: m.FromNode) -> None:
-        text = self._session.send(message)
-        assert isinstance(text, str)
-        await self._socket.send_str(text)
-
-    async def _send_live(self, said: LiveSaid) -> None:
+    async def _send(self, said: m.FromNode | LiveColumns) -> None:
+        if self._session.phase is Phase.CLOSED:
+            return  # we have said goodbye: nobody waits for this any more
         wire = self._session.send(said)
         if isinstance(wire, str):
             await self._socket.send_str(wire)

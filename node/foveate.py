@@ -36,6 +36,7 @@ from node.refine_texture import (
     db_of_mse,
     mse_of_db,
     quality_bounds,
+    select_texture,
 )
 from node.state import ClientState
 from node.texture_model import Expected, TextureModel
@@ -52,6 +53,9 @@ DOUBLINGS_MAX = 6
 NO_TEXTURE = 8.0  # doublings of error that an update without texture falls short by
 GENERIC_BYTES_PER_TEXEL = 0.04
 QUANTA_PER_SPACING = 6
+SKIRT_S = 1.0
+SKIRTS = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0)
+SKIRT_MARGIN = 2.0  # a skirt's cells differ more from each other than a window's texels
 
 Reason = Literal["complete", "byte limit", "superseded"]
 
@@ -85,15 +89,16 @@ def plan_update(
     budget_bytes: int | None = None,
     superseded: Callable[[], bool] = lambda: False,
     model: TextureModel | None = None,
+    quick: bool = False,
 ) -> Update:
     """Plan the update that answers a look.
 
     codec : the texture codec for this client.   budget_bytes : what the update may take; None for no limit.
     superseded : asked between encodes; when true, what is planned so far is dropped.
-    model : what the scan's texture takes, where that is known by now.
+    model : what the scan's texture takes, where that is known by now.   quick : spare time rather than bytes.
     Raises LatticeError or CodecError where explicit parameters do not fit the scan.
     """
-    planner = _Planner(scan, state.copy(), look, codec, budget_bytes, superseded, model)
+    planner = _Planner(scan, state.copy(), look, codec, budget_bytes, superseded, model, quick)
     try:
         planner.run()
     except _Superseded:
@@ -117,8 +122,10 @@ class _Planner:
         budget_bytes: int | None,
         superseded: Callable[[], bool],
         model: TextureModel | None,
+        quick: bool,
     ) -> None:
         self._scan, self._state, self._look, self._codec, self._model = scan, state, look, codec, model
+        self._quick = quick
         self._left = math.inf if budget_bytes is None else budget_bytes - REPLY_BYTES
         self._superseded = superseded
         self._coded: list[Coded] = []
@@ -126,8 +133,9 @@ class _Planner:
         self._limited = False
         self._texture_db: float | None = None
         s = scan.spec
-        self._range_region = region_round(look.u, look.v, look.window, s.width, s.height)
-        self._texture_region = region_round(look.u, look.v, look.window, s.texture_width, s.texture_height)
+        window = look.window if look.scale is None else look.scale**2
+        self._range_region = region_round(look.u, look.v, window, s.width, s.height)
+        self._texture_region = region_round(look.u, look.v, window, s.texture_width, s.texture_height)
         self._target_steps = look.range_mm / s.step_mm
         self._target_mse = mse_of_db(look.texture_db)
 
@@ -142,6 +150,8 @@ class _Planner:
         texture = self._search_texture(self._left - range_bytes)
         self._take(self._fill_range(wanted, self._left - (texture.wire_bytes if texture else 0)))
         self._take(texture)
+        if self._look.fill and not self._limited and math.isfinite(self._left):
+            self._fill_periphery(wanted)
 
     def update(self) -> Update:
         """What came of it."""
@@ -157,22 +167,30 @@ class _Planner:
         Without a limit, or where both qualities fit it: the cheapest that reach the quality. Else the pair that falls
         short the least, a doubled range error counting as much as 6 dB of texture.
         """
-        choice = choose_range(self._scan, self._state, self._range_region, self._target_steps)
-        range_bytes = self._range_bytes(choice.parameters)
+        wanted = self._choose_range(self._target_steps)
+        range_bytes = self._range_bytes(wanted)
         if math.isinf(self._left):
-            return choice.parameters, range_bytes
-        best, least = (choice.parameters, range_bytes), self._shortfall(0, self._left - range_bytes)
+            return wanted, range_bytes
+        best, least = (wanted, range_bytes), self._shortfall(0, self._left - range_bytes)
         doubled = 0
         while least > doubled and doubled < DOUBLINGS_MAX:
             doubled += 1
-            target = max(self._target_steps, 0.5) * 2**doubled
-            choice = choose_range(self._scan, self._state, self._range_region, target)
-            range_bytes = self._range_bytes(choice.parameters)
+            wanted = self._choose_range(max(self._target_steps, 0.5) * 2**doubled)
+            range_bytes = self._range_bytes(wanted)
             shortfall = self._shortfall(doubled, self._left - range_bytes)
             if shortfall < least:
-                best, least = (choice.parameters, range_bytes), shortfall
+                best, least = (wanted, range_bytes), shortfall
                 self._limited = True
         return best
+
+    def _choose_range(self, target_steps: float) -> RangeParameters:
+        """The cheapest parameters that reach a range error, with the skirt asked for."""
+        chosen = choose_range(self._scan, self._state, self._range_region, target_steps).parameters
+        return msgspec.structs.replace(chosen, s=self._skirt(chosen.p))
+
+    def _skirt(self, p: float) -> float:
+        """S' of the skirt: as the viewer's alpha says, else thin."""
+        return SKIRT_S if self._look.alpha is None else 1 / (self._look.alpha * p)
 
     def _range_bytes(self, wanted: RangeParameters) -> float:
         """What range is expected to take on the wire; 0 when the client holds it already."""
@@ -219,7 +237,7 @@ class _Planner:
     def _try_qualities(self, search: QualitySearch, p: float) -> bool:
         """Feed a search; False when the client holds all of this already."""
         while (quality := search.next_quality()) is not None:
-            coded = self._code_texture(TextureParameters(p=p, quality=quality, codec=self._codec))
+            coded = self._code_texture(TextureParameters(p, quality, self._codec, self._skirt(p)))
             if coded is None:
                 return False
             if search.fits(coded):
@@ -270,6 +288,26 @@ class _Planner:
                 low = middle + 1
         return msgspec.structs.replace(wanted, quantum=high)
 
+    # -- the periphery ---------------------------------------------------------------------------------------------
+
+    def _fill_periphery(self, wanted: RangeParameters) -> None:
+        """Spend what is left round the window: the widest skirt that is expected to fit, range first."""
+        for s in SKIRTS:
+            if self._range_bytes(msgspec.structs.replace(wanted, s=s)) <= self._left:
+                self._take(self._code_range(msgspec.structs.replace(wanted, s=s)))
+                break
+        last = next((coded for coded in reversed(self._coded) if coded.channel is Channel.TEXTURE), None)
+        if last is None:
+            return
+        sample_bytes = len(last.payload) / last.selection.samples
+        inner = TextureParameters(last.parameters.spacing, last.quality, self._codec)
+        for s in SKIRTS:
+            texture = msgspec.structs.replace(inner, s=s)
+            found, _ = select_texture(self._state, self._texture_region, texture)
+            if found and found[0].samples * found[0].adopted.mean() * sample_bytes * SKIRT_MARGIN <= self._left:
+                self._take(self._code_texture(texture))
+                return
+
     # -- one refinement --------------------------------------------------------------------------------------------
 
     def _code_range(self, wanted: RangeParameters) -> Coded | None:
@@ -278,7 +316,7 @@ class _Planner:
 
     def _code_texture(self, wanted: TextureParameters) -> Coded | None:
         self._count_encode()
-        return code_texture(self._scan, self._state, self._texture_region, wanted)
+        return code_texture(self._scan, self._state, self._texture_region, wanted, quick=self._quick)
 
     def _count_encode(self) -> None:
         if self._superseded():

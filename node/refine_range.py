@@ -26,7 +26,6 @@ from protocol.region import Region
 PERCENTILE = 99
 QUANTUM_MAX = 4096
 QUANTUM_SHARE_MAX = 2.5  # of the target; the error is at most half a quantum, less after interpolation
-SKIRT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +52,8 @@ def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: f
         size_bytes = trial.expected_bytes(quantum)
         if best is not None and size_bytes >= best.expected_bytes:
             break
-        best = Choice(RangeParameters(p=p, quantum=quantum, s=SKIRT_S), trial.error(quantum), size_bytes)
-    return best or Choice(RangeParameters(p=1, quantum=1, s=SKIRT_S), 0.0, 0.0)
+        best = Choice(RangeParameters(p=p, quantum=quantum), trial.error(quantum), size_bytes)
+    return best or Choice(RangeParameters(p=1, quantum=1), 0.0, 0.0)
 
 
 def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangeParameters) -> Coded | None:

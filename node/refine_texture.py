@@ -12,7 +12,7 @@ from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
-from protocol.grid import ImageArray
+from protocol.grid import BoolArray, ImageArray
 from protocol.holdings import ChannelHoldings, texture_rank
 from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice
 from protocol.messages import CodecName, TextureParameters
@@ -21,7 +21,6 @@ from protocol.region import Region
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 SPACINGS = (8, 4, 2, 1)
-SKIRT_S = 1.0
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -44,23 +43,33 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
     return 1
 
 
-def code_texture(scan: Scan, state: ClientState, region: Region, wanted: TextureParameters) -> Coded | None:
+def code_texture(
+    scan: Scan, state: ClientState, region: Region, wanted: TextureParameters, *, quick: bool = False
+) -> Coded | None:
     """Encode a refinement of the region's blocks, or None when the client holds all of it already.
 
+    quick : where the link is fast, spare time rather than bytes.
     Where a block that would become finer is held at a better quality, the whole refinement takes that one (F-09c).
     Raises LatticeError for a spacing that does not fit, CodecError for a quality the codec does not have.
     """
-    held = state.holdings.channels[Channel.TEXTURE]
-    lattice = build_lattice(held.shape, texture_lattice(region, wanted))
-    quality = max(wanted.quality, _best_held(held, lattice))
-    found = select(lattice, held, texture_rank(quality))
+    found, quality = select_texture(state, region, wanted)
     if found is None:
         return None
     codec = CODECS[wanted.codec]
     if quality != wanted.quality and quality > quality_bounds(wanted.codec)[1]:
         codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
-    payload = encode_texture(texture_samples(scan, found[0]), codec, quality)
+    payload = encode_texture(texture_samples(scan, found[0]), codec, quality, quick=quick)
     return Coded(*found, texture_rank(quality), quality, codec, payload)
+
+
+def select_texture(
+    state: ClientState, region: Region, wanted: TextureParameters
+) -> tuple[tuple[Selection, BoolArray] | None, int]:
+    """What code_texture would carry (the selection and the adopted blocks of its lattice; None: nothing), how good."""
+    held = state.holdings.channels[Channel.TEXTURE]
+    lattice = build_lattice(held.shape, texture_lattice(region, wanted))
+    quality = max(wanted.quality, _best_held(held, lattice))
+    return select(lattice, held, texture_rank(quality)), quality
 
 
 def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:
@@ -117,7 +126,7 @@ def _overlaps(region: Region, columns: slice) -> Iterator[slice]:
 
 
 def _whole(shape: ChannelShape, region: Region, p: float) -> Selection | None:
-    parameters = texture_lattice(region, TextureParameters(p=p, s=SKIRT_S))
+    parameters = texture_lattice(region, TextureParameters(p=p))
     if parameters.blocks_wide == shape.blocks[1] and 2 * shape.width % parameters.half_spacing:
         return None
     fresh = ChannelHoldings.coarse(shape)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from node.library import Scan
 from protocol.grid import VOID, BoolArray, ImageArray, IntArray, StepArray
 from protocol.lattice import Axis
-from protocol.reconstruct import Selection, cut
+from protocol.reconstruct import Selection, Window, cut
 
 
 def range_samples(scan: Scan, selection: Selection) -> tuple[StepArray, BoolArray]:
@@ -43,16 +44,18 @@ def _run(index: IntArray) -> IntArray | slice:
 
 def _stencil(selection: Selection) -> BoolArray:
     """Which transmitted samples are corners of an adopted cell's stencil. sample_shape bool."""
-    cells = selection.adopted_cells()
-    y, x = selection.y, selection.x
-    needed = np.zeros(selection.sample_shape, np.bool_)
-    by_row = np.zeros((y.sample.size, cells.shape[1]), np.bool_)
-    for side, weight in ((y.low, y.whole - y.part), (y.high, y.part)):
-        np.logical_or.at(by_row, side[weight > 0], cells[weight > 0])
-    columns = needed.T
-    for side, weight in ((x.low, x.whole - x.part), (x.high, x.part)):
-        np.logical_or.at(columns, side[weight > 0], by_row.T[weight > 0])
-    return needed
+    y, x = (_samples_of_blocks(window) for window in (selection.y, selection.x))
+    return np.asarray(y.T @ selection.adopted.astype(np.float32) @ x > 0)
+
+
+def _samples_of_blocks(window: Window) -> NDArray[np.float32]:
+    """Which transmitted samples each block of an axis hangs on. (blocks, samples) float32, 0 or 1."""
+    block = np.repeat(np.arange(window.size.size), window.size)
+    hangs = np.zeros((window.size.size, window.sample.size), np.float32)
+    hangs[block, window.low] = 1
+    between = window.part > 0
+    hangs[block[between], window.high[between]] = 1
+    return hangs
 
 
 def void_cells(scan: Scan, selection: Selection) -> BoolArray:
@@ -64,7 +67,17 @@ def void_cells(scan: Scan, selection: Selection) -> BoolArray:
 
 
 def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
-    """Mean colour of each transmitted cell. sample_shape + (3,) uint8."""
+    """Mean colour of each transmitted cell. sample_shape + (3,) uint8; the nearest seen cell's where nobody looks."""
+    texels = _cell_means(scan, selection)
+    if selection.adopted.all():
+        return texels
+    hidden = (~_stencil(selection)).view(np.uint8)
+    _, label = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L1, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL)
+    seen = np.concatenate([texels[:1, 0], texels[hidden == 0]])  # labels count seen texels from 1
+    return np.asarray(seen[label], np.uint8)
+
+
+def _cell_means(scan: Scan, selection: Selection) -> ImageArray:
     lattice = selection.lattice
     y, x = _Cells(lattice.y, selection.y.sample), _Cells(lattice.x, selection.x.sample)
     spacing = lattice.parameters.half_spacing

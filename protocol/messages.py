@@ -234,6 +234,8 @@ class Look(_Message, frozen=True):
     """Refine round a click, until the quality is reached or the budget is spent. Newer looks supersede older ones.
 
     window : share of the area.  texture_db, range_mm : quality to stop at.  fill : spend what is left on the periphery.
+    alpha : how fast detail falls off outside the window (S' = 1 / (alpha p)); null: the node's choice.
+    scale : the window as a share of each axis, instead of `window`.
     """
 
     request: Count
@@ -245,6 +247,8 @@ class Look(_Message, frozen=True):
     max_wait_s: Seconds | None = None
     max_bytes: ByteCount | None = None
     fill: bool = False
+    alpha: Annotated[float, Meta(ge=0.005, le=4)] | None = None
+    scale: Share | None = None
     profile: Literal["default"] = "default"
     parameters: LookParameters | None = None
 

@@ -200,3 +200,31 @@ def test_first_view_fits_and_is_the_same_for_the_node(scan: Scan) -> None:
         assert sum(len(part) for part in view.refinements(0)) <= 32768
         state = Viewer(scan, view).state
         assert state.holdings.channels[Channel.RANGE].level.min() == state.shapes[Channel.RANGE].coarse_level
+
+
+def test_alpha_widens_the_skirt_and_scale_the_window(scan: Scan, view: FirstView) -> None:
+    narrow = plan_update(scan, view.state, Look(1, 0.5, 0.5), "htj2k")
+    soft = plan_update(scan, view.state, Look(1, 0.5, 0.5, alpha=0.05), "htj2k")
+    wide = plan_update(scan, view.state, Look(1, 0.5, 0.5, scale=0.5), "htj2k")
+    assert soft.coded[0].parameters.rho_x < narrow.coded[0].parameters.rho_x
+    assert sum(c.adopted.sum() for c in soft.coded) > sum(c.adopted.sum() for c in narrow.coded)
+    assert wide.coded[0].parameters.blocks_wide > 1.5 * narrow.coded[0].parameters.blocks_wide
+
+
+def test_fill_spends_the_rest_on_the_periphery(scan: Scan, view: FirstView, model_of_texture: TextureModel) -> None:
+    budget = 60_000
+    plain = plan_update(scan, view.state, Look(1, 0.7, 0.5), "htj2k", budget, model=model_of_texture)
+    filled = plan_update(scan, view.state, Look(1, 0.7, 0.5, fill=True), "htj2k", budget, model=model_of_texture)
+    assert plain.wire_bytes < filled.wire_bytes <= budget
+    levels = [update.state.holdings.channels[Channel.TEXTURE].level for update in (plain, filled)]
+    assert (levels[1] <= levels[0]).all()
+    assert (levels[1] < levels[0]).sum() > 20
+
+
+def test_a_click_beside_a_held_window_costs_what_is_new(scan: Scan, view: FirstView) -> None:
+    viewer = Viewer(scan, view)
+    whole = plan_update(scan, viewer.state, Look(1, 0.75, 0.5), "htj2k").wire_bytes
+    viewer.take(plan_update(scan, viewer.state, Look(1, 0.65, 0.5), "htj2k"))
+    rest = plan_update(scan, viewer.state, Look(1, 0.75, 0.5), "htj2k")
+    viewer.take(rest)
+    assert rest.wire_bytes < 0.75 * whole
