@@ -5,11 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m
 PIP := $(RUN) pip --disable-pip-version-check -q
+VIEWER := client/viewer
+PAGE := $(VIEWER)/dist/.stamp
+PAGE_SOURCES := $(shell find $(VIEWER)/src -type f) $(addprefix $(VIEWER)/,package-lock.json build.mjs index.html)
 
 .DELETE_ON_ERROR:
 .PHONY: install demo test lint bench lock clean
 
-install: $(VENV)/.app
+install: $(VENV)/.app $(PAGE)
 
 demo: install
 	$(BIN)/foveascan demo $(ARGS)
@@ -21,6 +24,7 @@ lint: install
 	$(BIN)/ruff check .
 	$(RUN) mypy
 	$(BIN)/lint-imports
+	$(BIN)/python hatch_build.py check
 
 bench: install
 	$(BIN)/foveascan bench $(ARGS)
@@ -30,9 +34,11 @@ lock: $(VENV)/.pip
 	$(PIP) install uv
 	$(RUN) uv -q pip compile --upgrade --universal --python-version 3.11 --fork-strategy fewest --generate-hashes --no-annotate --no-header \
 		--no-emit-index-url --no-emit-find-links --extra dev pyproject.toml requirements.in -o constraints.txt > /dev/null
+	$(BIN)/python -c 'import hatch_build; print(hatch_build.NODE_WHEEL)' | $(RUN) uv -q pip compile --upgrade --universal --python-version 3.11 \
+		--generate-hashes --no-annotate --no-header --no-emit-index-url - -o constraints-node.txt > /dev/null
 
 clean:
-	rm -rf $(VENV) dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) dist $(VIEWER)/dist $(VIEWER)/node_modules .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.pip:
@@ -50,6 +56,11 @@ $(VENV)/.deps: constraints.txt $(VENV)/.pip
 	@$(PIP) install --require-hashes -r constraints.txt
 	@touch $@
 
-$(VENV)/.app: pyproject.toml $(VENV)/.deps
+$(PAGE): $(PAGE_SOURCES) hatch_build.py | $(VENV)/.deps
+	@if [ -n "$$($(BIN)/python hatch_build.py requires)" ]; then $(PIP) install --require-hashes -r constraints-node.txt; fi
+	@$(BIN)/python hatch_build.py build
+	@touch $@
+
+$(VENV)/.app: pyproject.toml hatch_build.py $(VENV)/.deps | $(PAGE)
 	@$(PIP) install --no-deps --no-build-isolation -e .
 	@touch $@

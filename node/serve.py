@@ -19,6 +19,7 @@ from node.exhibits import Exhibits
 from node.first_view import scan_info
 from node.library import ScanSummary
 from node.live import Live
+from node.page import Page
 from protocol import messages as m
 from protocol.errors import LibraryError
 
@@ -29,7 +30,8 @@ SEND_BUFFER_BYTES = 64 * 1024
 WRITE_LIMIT_BYTES = 16 * 1024
 HEARTBEAT_S = 20.0
 BODY_MAX_BYTES = 1 << 16
-GOODBYE_S = 2.0
+GOODBYE_S = 1.0
+REQUESTS_S = 1.0  # that requests in work get to end when the node stops
 SECURITY_HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -50,11 +52,11 @@ class NodeServer:
         self._live = live
         self._capture = capture
         self._auth = Auth(config.server)
-        self._connections: set[Connection] = set()
+        self._connections: dict[Connection, asyncio.Transport] = {}
         self._app = web.Application(middlewares=[self._auth.admit, _explain], client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.append(_harden)
         self._app.add_routes([
-            web.get("/", self._page),
+            *Page().routes(),
             web.get("/healthz", self._health),
             web.get("/v1/node", self._node),
             web.get("/v1/scans", self._scans),
@@ -63,7 +65,7 @@ class NodeServer:
             web.post("/v1/sweeps", self._sweep),
             web.get("/v1/stream", self._stream),
         ])  # fmt: skip
-        self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False)
+        self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=REQUESTS_S)
 
     async def start(self) -> tuple[str, int]:
         """Begin to listen. Returns the address bound. Raises OSError when it cannot be."""
@@ -74,10 +76,12 @@ class NodeServer:
         return str(host), int(port)
 
     async def stop(self) -> None:
-        """Tell every client, then stop listening."""
-        goodbyes = [connection.close("the node is stopping") for connection in self._connections]
+        """Tell every client, hang up on those that do not listen, then stop listening."""
+        goodbyes = [asyncio.ensure_future(connection.close("the node is stopping")) for connection in self._connections]
         if goodbyes:
-            await asyncio.wait([asyncio.ensure_future(goodbye) for goodbye in goodbyes], timeout=GOODBYE_S)
+            await asyncio.wait(goodbyes, timeout=GOODBYE_S)
+        for line in self._connections.values():
+            line.abort()
         await self._runner.cleanup()
 
     def publish(self, scan_id: str) -> None:
@@ -91,10 +95,6 @@ class NodeServer:
             connection.show_live()
 
     # -- what may be asked -----------------------------------------------------------------------------------------
-
-    async def _page(self, request: web.Request) -> web.Response:
-        how = f"foveascan look --node {request.url.origin()}"
-        return web.Response(text=f"foveascan node {self._info.name}: use the command `{how}`\n")
 
     async def _health(self, request: web.Request) -> web.Response:
         return _json({"status": "ready", "capture": self._capture_status()})
@@ -133,14 +133,17 @@ class NodeServer:
             writer_limit=WRITE_LIMIT_BYTES,
         )  # fmt: skip
         await stream.prepare(request)
-        _bound_buffers(request)
+        line = request.transport
+        if line is None:  # gone again already
+            return stream
+        _bound_buffers(line)
         cold_start = self._config.planner.cold_start_bytes_s
         connection = Connection(stream, self._auth, self._exhibits, self._live, self._info, cold_start)
-        self._connections.add(connection)
+        self._connections[connection] = line
         try:
             await connection.run()
         finally:
-            self._connections.discard(connection)
+            del self._connections[connection]
         return stream
 
     def _capture_status(self) -> dict[str, object]:
@@ -159,11 +162,8 @@ def _json(value: object, status: int = 200) -> web.Response:
     return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
 
 
-def _bound_buffers(request: web.Request) -> None:
+def _bound_buffers(transport: asyncio.Transport) -> None:
     """Keep little between us and a slow client, so that a click overtakes what was meant for an older one."""
-    transport = request.transport
-    if transport is None:
-        return
     transport.set_write_buffer_limits(high=WRITE_LIMIT_BYTES)
     line = transport.get_extra_info("socket")
     line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -173,7 +173,8 @@ def _bound_buffers(request: web.Request) -> None:
 
 
 async def _harden(request: web.Request, response: web.StreamResponse) -> None:
-    response.headers.update(SECURITY_HEADERS)
+    for name, value in SECURITY_HEADERS.items():
+        response.headers.setdefault(name, value)
 
 
 @web.middleware

@@ -36,6 +36,15 @@ RANGES = (
     ("range_row", RangeCodec.HTJ2K, (1, 40)),
     ("range_patch", RangeCodec.HTJ2K, (57, 64)),
 )
+# Lifted range: quantum, shape; the last one jumps so far that bytes and words of escapes are needed.
+LIFTED = (
+    ("range_lift_one", 1, (1, 1)),
+    ("range_lift_row", 1, (1, 40)),
+    ("range_lift_column", 3, (31, 1)),
+    ("range_lift_patch", 1, (57, 64)),
+    ("range_lift_quantised", 10, (33, 50)),
+    ("range_lift_rough", 1, (20, 9)),
+)
 MASKS = ("mask_none", "mask_all", "mask_edges", "mask_noise")
 HEADER_SIDES = (1, 8, 16, 32, 64, 128, 256, 512)
 
@@ -43,7 +52,7 @@ HEADER_SIDES = (1, 8, 16, 32, 64, 128, 256, 512)
 def main() -> None:
     """Write vectors.json and the files it names."""
     FOLDER.mkdir(exist_ok=True)
-    vectors = [*_texture_vectors(), *_range_vectors(), *_mask_vectors()]
+    vectors = [*_texture_vectors(), *_range_vectors(), *_lift_vectors(), *_mask_vectors()]
     index = {"headers": header_hashes(), "vectors": vectors}
     (FOLDER / "vectors.json").write_text(json.dumps(index, indent=1) + "\n")
 
@@ -78,6 +87,15 @@ def _range_vectors() -> Iterator[dict[str, Any]]:
         yield _write(name, "range", payload, _range(shape), codec=int(kind), stream_sha256=_sha256(stream))
 
 
+def _lift_vectors() -> Iterator[dict[str, Any]]:
+    for name, quantum, shape in LIFTED:
+        values = _rough(shape) if name.endswith("rough") else _range(shape)
+        payload = codec.encode_range(values, RangeCodec.LIFT, quantum)
+        decoded = codec.decode_range(payload, RangeCodec.LIFT, shape, quantum)
+        facts = {"codec": int(RangeCodec.LIFT), "quantum": quantum, "stream_sha256": _sha256(payload)}
+        yield _write(name, "range", payload, decoded, **facts)
+
+
 def _mask_vectors() -> Iterator[dict[str, Any]]:
     for name in MASKS:
         mask = _mask(name)
@@ -100,6 +118,11 @@ def _range(shape: tuple[int, int]) -> StepArray:
     y, x = np.mgrid[: shape[0], : shape[1]]
     values: StepArray = (40_000 + 3 * (x - 20) ** 2 - 2 * (y - 30) ** 2 + x * y % 7).astype(np.uint16)
     return values
+
+
+def _rough(shape: tuple[int, int]) -> StepArray:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return np.where((x + 2 * y) % 3 == 0, 1 + x * y % 300, 65535 - 40 * x).astype(np.uint16)
 
 
 def _mask(name: str) -> BoolArray:

@@ -211,7 +211,7 @@ def decoded(vector: dict[str, Any], payload: bytes) -> NDArray[Any]:
     if vector["channel"] == "mask":
         return codec.decode_mask(payload, shape)
     if vector["channel"] == "range":
-        return codec.decode_range(payload, RangeCodec(vector["codec"]), shape)
+        return codec.decode_range(payload, RangeCodec(vector["codec"]), shape, vector.get("quantum", 1))
     return codec.decode_texture(payload, TextureCodec(vector["codec"]), vector["quality"], shape)
 
 

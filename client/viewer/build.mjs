@@ -1,0 +1,43 @@
+// Bundles the page into a folder: `node build.mjs dist`. Names carry a hash of their content, so that they may be
+// cached for ever; the page itself names them. `node build.mjs --tests OUT` bundles the unit tests instead.
+import { build } from 'esbuild';
+import { mkdir, readFile, readdir, rm, writeFile } from 'node:fs/promises';
+import { join } from 'node:path';
+import { constants, gzipSync } from 'node:zlib';
+
+const COMMON = {
+  bundle: true, format: 'esm', target: 'es2022', legalComments: 'none', logLevel: 'warning', charset: 'utf8',
+  loader: { '.wasm': 'file', '.svg': 'file' }, assetNames: '[name]-[hash]', entryNames: '[name]-[hash]',
+};
+
+const named = (outputs, entry) => {
+  const [path] = Object.entries(outputs).find(([, output]) => output.entryPoint === entry);
+  return path.split('/').at(-1);
+};
+
+async function page(out) {
+  await rm(out, { recursive: true, force: true });
+  await mkdir(out, { recursive: true });
+  const common = { ...COMMON, minify: true, platform: 'browser', external: ['fs', 'path'], outdir: out, metafile: true };
+  const worker = named((await build({ ...common, entryPoints: ['src/worker.ts'] })).metafile.outputs, 'src/worker.ts');
+  const define = { WORKER_FILE: JSON.stringify(worker) };
+  const outputs = (await build({ ...common, define, entryPoints: ['src/main.ts', 'src/style.css'] })).metafile.outputs;
+  const names = { script: named(outputs, 'src/main.ts'), style: named(outputs, 'src/style.css'), worker };
+  const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name]);
+  await writeFile(join(out, 'index.html'), html);
+  for (const file of await readdir(out)) await squeeze(join(out, file));
+}
+
+async function squeeze(path) {
+  const packed = gzipSync(await readFile(path), { level: constants.Z_BEST_COMPRESSION });
+  await writeFile(`${path}.gz`, packed);
+}
+
+async function tests(out) {
+  const entryPoints = (await readdir('tests')).filter((name) => name.endsWith('.test.ts')).map((name) => `tests/${name}`);
+  const banner = { js: "import { createRequire } from 'node:module'; const require = createRequire(import.meta.url); const __dirname = import.meta.dirname, __filename = import.meta.filename;" };
+  await build({ ...COMMON, entryPoints, outdir: out, entryNames: '[name]', outExtension: { '.js': '.mjs' }, platform: 'node', banner });
+}
+
+const [first, second] = process.argv.slice(2);
+await (first === '--tests' ? tests(second) : page(first ?? 'dist'));

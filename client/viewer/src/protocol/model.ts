@@ -1,0 +1,198 @@
+// The dense model of a scan: filled by the first view, made finer by refinements, never coarser.
+// Mirrors client/model.py and client/replica.py.
+
+import { HoldingsDiffer, RemoteWireError } from './errors.ts';
+import { Codecs } from './codec.ts';
+import { ChannelHoldings, hashBlock, Holdings, rankOf } from './holdings.ts';
+import { blockSide, buildLattice, RANGE, TEXTURE } from './lattice.ts';
+import type { Channel, ChannelShape } from './lattice.ts';
+import { channelShapes } from './messages.ts';
+import type { FromClient, ScanInfo, Statement } from './messages.ts';
+import {
+  coarseToRange, forEachAdopted, onlyFiner, paste, rangePatch, select, selectionSamples, spans, texturePatch,
+} from './reconstruct.ts';
+import type { Selection, Span } from './reconstruct.ts';
+import { COARSE } from './refinement.ts';
+import type { Refinement } from './refinement.ts';
+
+const STATEMENTS_MAX = 3;
+
+/** A rectangle of the dense model that has changed: steps of range, or RGBA of texture. */
+export interface Changed extends Omit<Span, 'source'> {
+  cells: Uint16Array | Uint8Array;
+}
+
+/**
+ * Dense state of one scan, and our place in the node's refinements of it.
+ * steps: range, 0 = void. texels: RGBA, alpha 0 where only the first view is known, which is `coarseTexels`.
+ */
+export class Model {
+  readonly shapes: { [RANGE]: ChannelShape; [TEXTURE]: ChannelShape };
+  holdings: Holdings;
+  steps: Uint16Array = new Uint16Array();
+  coarseTexels: Uint8Array = new Uint8Array();
+  nextSeq = 0;
+  private dense: Uint32Array | null = null;
+  private readonly viewed = new Set<Channel>();
+  private stated = false;
+  private statements = 0;
+
+  constructor(readonly info: ScanInfo, public epoch: number) {
+    this.shapes = channelShapes(info);
+    this.holdings = new Holdings(this.shapes);
+  }
+
+  /** The first view of both channels is in. */
+  get complete(): boolean {
+    return this.viewed.size === 2;
+  }
+
+  /** RGBA of the refined texture; its memory is taken when first needed. */
+  get texels(): Uint32Array {
+    this.dense ??= new Uint32Array(this.info.textureWidth * this.info.textureHeight);
+    return this.dense;
+  }
+
+  /** Whether any texture has been refined. */
+  get hasTexels(): boolean {
+    return this.dense !== null;
+  }
+
+  /** Whether a refinement is the next one of this opening. Throws RemoteWireError for a void or repeated one. */
+  isNext(refinement: Refinement): boolean {
+    if (refinement.epoch !== this.epoch || refinement.seq < this.nextSeq) {
+      throw new RemoteWireError(`refinement ${refinement.seq} when ${this.nextSeq} is next`);
+    }
+    return refinement.seq === this.nextSeq;
+  }
+
+  /** Take in one refinement. Throws HoldingsDiffer or RemoteWireError; the model is then unchanged. */
+  async apply(refinement: Refinement, codecs: Codecs): Promise<Changed[]> {
+    const changed = refinement.generator === COARSE
+      ? await this.applyFirstView(refinement, codecs)
+      : await this.applyFovea(refinement, codecs);
+    this.nextSeq++;
+    [this.stated, this.statements] = [false, 0];
+    return changed;
+  }
+
+  /** What to say when everything sent so far is applied. */
+  acknowledge(applyMs: number): FromClient {
+    return { type: 'ack', epoch: this.epoch, nextSeq: this.nextSeq, digest: this.holdings.digest(), applyMs };
+  }
+
+  /** What to say to a refinement that does not fit; null when we said it and the node has not gone on yet. */
+  object(): FromClient | null {
+    return this.stated ? null : this.state();
+  }
+
+  /** What we hold. Throws RemoteWireError when saying so again and again brings no agreement. */
+  state(): FromClient {
+    if (this.statements === STATEMENTS_MAX) throw new RemoteWireError('no agreement on what we hold');
+    this.stated = true;
+    this.statements++;
+    return { type: 'state', epoch: this.epoch, nextSeq: this.nextSeq, holdings: this.statement() };
+  }
+
+  /** Our holdings as they travel. From here on the digest counts anew, as it does at the node. */
+  statement(): Statement {
+    this.holdings.content = 0;
+    return { range: this.holdings.channels[RANGE].toRuns(), texture: this.holdings.channels[TEXTURE].toRuns() };
+  }
+
+  /** Go on in a new opening of the same scan. */
+  resume(epoch: number): void {
+    this.epoch = epoch;
+    this.nextSeq = 0;
+    [this.stated, this.statements] = [false, 0];
+  }
+
+  private async applyFirstView(refinement: Refinement, codecs: Codecs): Promise<Changed[]> {
+    const { channel, payload, codec, quality, samples } = refinement;
+    const shape = this.shapes[channel];
+    const [height, width] = [shape.coarseHeight, shape.coarseWidth];
+    if (this.viewed.has(channel)) throw new RemoteWireError('a second first view');
+    if (samples !== height * width) throw new RemoteWireError(`first view of ${samples} samples`);
+    rankOf(channel, quality);
+    if (channel === RANGE) {
+      const coarse = await codecs.range(payload, codec, height, width, quality);
+      await applyMask(coarse, refinement, codecs, height, width);
+      this.steps = coarseToRange(coarse, shape);
+    } else {
+      this.coarseTexels = await codecs.texture(payload, codec, height, width, quality);
+    }
+    this.viewed.add(channel);
+    return [];
+  }
+
+  private async applyFovea(refinement: Refinement, codecs: Codecs): Promise<Changed[]> {
+    if (!this.complete) throw new RemoteWireError('a fovea before the first view');
+    const { channel, payload, codec, quality } = refinement;
+    const rank = rankOf(channel, quality);
+    const { selection, adopted } = this.selected(refinement, rank);
+    const [rows, columns] = [selection.y.sample.length, selection.x.sample.length];
+    const changed = channel === RANGE
+      ? await this.pasteRange(selection, await codecs.range(payload, codec, rows, columns, quality), refinement, codecs)
+      : this.pasteTexture(selection, await codecs.texture(payload, codec, rows, columns, quality));
+    this.holdings.channels[channel].adopt(selection.lattice, adopted, rank);
+    return changed;
+  }
+
+  private selected(refinement: Refinement, rank: number): { selection: Selection; adopted: Uint8Array } {
+    const { channel, parameters, samples, selfContained } = refinement;
+    const held = this.holdings.channels[channel];
+    const plannedOver = selfContained ? new ChannelHoldings(this.shapes[channel]) : held;
+    const chosen = select(buildLattice(this.shapes[channel], parameters!), plannedOver, rank);
+    const expected = chosen ? selectionSamples(chosen.selection) : 0;
+    if (!chosen || expected !== samples) throw new HoldingsDiffer(`${samples} samples, ${expected} expected`);
+    return selfContained ? onlyFiner(chosen, held, rank) : chosen;
+  }
+
+  private async pasteRange(
+    selection: Selection, samples: Uint16Array, refinement: Refinement, codecs: Codecs,
+  ): Promise<Changed[]> {
+    const patch = rangePatch(selection, samples);
+    const columns = selection.x.low.length;
+    await applyMask(patch, refinement, codecs, selection.y.low.length, columns);
+    paste(this.steps, patch, selection);
+    forEachAdopted(selection, ({ row, column, height, wide, block }) => {
+      this.holdings.addContent(block, hashBlock(patch, row * columns + column, columns, wide, height));
+    });
+    return this.cut(this.steps, selection);
+  }
+
+  private pasteTexture(selection: Selection, samples: Uint8Array): Changed[] {
+    const patch = texturePatch(selection, samples);
+    paste(this.texels, new Uint32Array(patch.buffer), selection);
+    return this.cut(this.texels, selection);
+  }
+
+  private cut(dense: Uint16Array | Uint32Array, selection: Selection): Changed[] {
+    return spans(selection).map(({ x, y, width, height }) => {
+      const cells = dense instanceof Uint16Array ? new Uint16Array(width * height) : new Uint32Array(width * height);
+      const side = selection.lattice.shape.width;
+      for (let row = 0; row < height; row++) {
+        const from = (y + row) * side + x;
+        cells.set(dense.subarray(from, from + width), row * width);
+      }
+      return { x, y, width, height, cells: cells instanceof Uint16Array ? cells : new Uint8Array(cells.buffer) };
+    });
+  }
+}
+
+async function applyMask(
+  steps: Uint16Array, { mask, channel }: Refinement, codecs: Codecs, height: number, width: number,
+): Promise<void> {
+  if (mask.length === 0) return;
+  if (channel === TEXTURE) throw new RemoteWireError('texture has no voids of its own');
+  const voids = await codecs.mask(mask, height, width);
+  voids.forEach((isVoid, index) => {
+    if (isVoid) steps[index] = 0;
+  });
+}
+
+/** Level of the block under each cell of the grid: the spacing held there is 2^(level / 2). */
+export function levelAt(held: ChannelHoldings, column: number, row: number): number {
+  const side = blockSide(held.shape);
+  return held.level[Math.floor(row / side) * Math.ceil(held.shape.width / side) + Math.floor(column / side)]!;
+}

@@ -1,0 +1,91 @@
+// One refinement on the wire: mirrors protocol/refinement.py (PROTOCOL.md, "Refinement").
+
+import { crc32 } from './crc32.ts';
+import { RemoteWireError } from './errors.ts';
+import { RANGE, TEXTURE } from './lattice.ts';
+import type { Channel, Parameters } from './lattice.ts';
+
+const MAGIC = 0x5246;
+const VERSION = 1;
+const HEADER_BYTES = 36;
+const CRC_BYTES = 4;
+const PARAMETERS_BYTES = 17;
+const PARAMETERS_MAX = 4096;
+const MASK_MAX = 8 << 20;
+const PAYLOAD_MAX = 256 << 20;
+
+export const COARSE = 0;
+export const FOVEA = 1;
+
+export interface Refinement {
+  generator: number;
+  channel: Channel;
+  epoch: number;
+  seq: number;
+  look: number;
+  codec: number;
+  quality: number;
+  samples: number;
+  selfContained: boolean;
+  parameters: Parameters | null;
+  mask: Uint8Array;
+  payload: Uint8Array;
+}
+
+/** Read a whole, intact refinement. Throws RemoteWireError. */
+export function parseRefinement(data: Uint8Array): Refinement {
+  if (data.length < HEADER_BYTES + CRC_BYTES) throw new RemoteWireError('refinement is cut short');
+  const view = new DataView(data.buffer, data.byteOffset, data.length);
+  const [u8, u16, u32] = [
+    (at: number) => view.getUint8(at), (at: number) => view.getUint16(at, true), (at: number) => view.getUint32(at, true),
+  ];
+  const [generator, channel] = [u8(3), u8(4)];
+  if (u16(0) !== MAGIC || u8(2) !== VERSION) throw new RemoteWireError(`not a refinement of version ${VERSION}`);
+  if (generator > FOVEA || channel > TEXTURE) throw new RemoteWireError('refinement of unknown kind');
+  const [parametersSize, maskSize, payloadSize] = [u16(24), u32(28), u32(32)];
+  if (parametersSize > PARAMETERS_MAX || maskSize > MASK_MAX || payloadSize > PAYLOAD_MAX) {
+    throw new RemoteWireError('refinement announces more than is allowed');
+  }
+  const maskAt = HEADER_BYTES + parametersSize;
+  const payloadAt = maskAt + maskSize;
+  const end = payloadAt + payloadSize;
+  if (data.length !== end + CRC_BYTES) throw new RemoteWireError(`refinement of ${data.length} bytes announces ${end + 4}`);
+  if (u32(end) !== crc32(data.subarray(0, end))) throw new RemoteWireError('refinement fails its checksum');
+  const parameters = parametersSize ? parseParameters(data.subarray(HEADER_BYTES, maskAt)) : null;
+  if ((parameters === null) !== (generator === COARSE)) {
+    throw new RemoteWireError('a first view carries no lattice; everything else does');
+  }
+  return {
+    generator, channel: channel === RANGE ? RANGE : TEXTURE, epoch: u16(8), seq: u32(12), look: u32(16), codec: u8(5),
+    quality: u16(10), samples: u32(20), selfContained: (u8(6) & 1) === 1, parameters,
+    mask: data.subarray(maskAt, payloadAt), payload: data.subarray(payloadAt, end),
+  };
+}
+
+/** Lattice parameters as they travel. Throws RemoteWireError when the bytes are not whole. */
+export function parseParameters(data: Uint8Array): Parameters {
+  if (data.length < PARAMETERS_BYTES) throw new RemoteWireError('lattice parameters are cut short');
+  const view = new DataView(data.buffer, data.byteOffset, data.length);
+  const u16 = (at: number) => view.getUint16(at, true);
+  return {
+    halfSpacing: view.getUint8(0), blockX: u16(1), blockY: u16(3), blocksWide: u16(5), blocksHigh: u16(7),
+    rhoX: view.getUint32(9, true), rhoY: view.getUint32(13, true),
+    listed: data.length > PARAMETERS_BYTES ? parseVarints(data.subarray(PARAMETERS_BYTES), 5) : null,
+  };
+}
+
+/** Numbers of seven bits a byte, low first, each of at most `most` bytes. Throws RemoteWireError. */
+export function parseVarints(data: Uint8Array, most: number): number[] {
+  const values: number[] = [];
+  let [value, bytes] = [0, 0];
+  for (const byte of data) {
+    value += (byte & 0x7f) * 2 ** (7 * bytes++);
+    if (bytes > most) throw new RemoteWireError('a number out of bounds');
+    if (byte < 0x80) {
+      values.push(value);
+      [value, bytes] = [0, 0];
+    }
+  }
+  if (bytes) throw new RemoteWireError('numbers are cut short');
+  return values;
+}

@@ -1,0 +1,91 @@
+"""The browser page: what the package's build put into client/viewer/dist, read once and served from memory."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from aiohttp import web
+
+DIST = Path(__file__).resolve().parents[1] / "client" / "viewer" / "dist"
+MEDIA_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".wasm": "application/wasm",
+    ".svg": "image/svg+xml",
+}
+# The build writes a hash of its content into every name but the page's own.
+FOR_EVER = "public, max-age=31536000, immutable"
+ASK_AGAIN = "no-cache"
+POLICY = (
+    "default-src 'none'; script-src 'self'{wasm}; worker-src 'self'; connect-src 'self'; style-src 'self'; "
+    "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+NOT_BUILT = "The page is not built: run `make`, or install the wheel. The command `foveascan look --node {}` works.\n"
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    media_type: str
+    body: bytes
+    packed: bytes
+    tag: str
+
+
+class Page:
+    """The page and its parts. folder : what the build wrote; where there is none, the page says so."""
+
+    def __init__(self, folder: Path = DIST) -> None:
+        self._files = {path.name: _read(path) for path in _built(folder)}
+
+    def routes(self) -> list[web.RouteDef]:
+        """What to add to the application."""
+        return [web.get("/", self._page), web.get("/assets/{name}", self._asset)]
+
+    async def _page(self, request: web.Request) -> web.Response:
+        page = self._files.get("index.html")
+        if page is None:
+            return web.Response(text=NOT_BUILT.format(request.url.origin()))
+        return _respond(request, page, ASK_AGAIN)
+
+    async def _asset(self, request: web.Request) -> web.Response:
+        file = self._files.get(request.match_info["name"])
+        if file is None:
+            raise web.HTTPNotFound(text="no such part of the page: load it again")
+        return _respond(request, file, FOR_EVER)
+
+
+def _built(folder: Path) -> list[Path]:
+    return [path for path in folder.glob("*") if path.suffix in MEDIA_TYPES]
+
+
+def _read(path: Path) -> _File:
+    body = path.read_bytes()
+    packed = path.with_name(f"{path.name}.gz")
+    return _File(
+        MEDIA_TYPES[path.suffix],
+        body,
+        packed.read_bytes() if packed.exists() else gzip.compress(body),
+        f'"{hashlib.sha256(body).hexdigest()[:32]}"',
+    )
+
+
+def _respond(request: web.Request, file: _File, cache: str) -> web.Response:
+    # A worker takes its policy from its own script's response: WASM may be compiled there and nowhere else.
+    is_worker = request.match_info.get("name", "").startswith("worker-")
+    headers = {
+        "Content-Type": file.media_type,
+        "Cache-Control": cache,
+        "Content-Security-Policy": POLICY.format(wasm=" 'wasm-unsafe-eval'" if is_worker else ""),
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "ETag": file.tag,
+        "Vary": "Accept-Encoding",
+    }
+    if request.headers.get("If-None-Match") == file.tag:
+        return web.Response(status=304, headers=headers)
+    if "gzip" in request.headers.get("Accept-Encoding", ""):
+        return web.Response(body=file.packed, headers={**headers, "Content-Encoding": "gzip"})
+    return web.Response(body=file.body, headers=headers)
