@@ -55,8 +55,9 @@ class Placing:
 def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | None = None) -> Mesh:
     """The triangles of a file. texture : an image instead of the file's own.
 
-    Without texture or colours a face is grey. Raises ExchangeError for a file that is no mesh we read, or one that
-    stands beside the axis; OSError for one that cannot be opened.
+    A face without texture has its corners', its own or its material's colour, and grey without any. Raises
+    ExchangeError for a file that is no mesh we read, or one that stands beside the axis; OSError for one that cannot
+    be opened.
     """
     suffix = path.suffix.lower()
     if path.stat().st_size > FILE_BYTES_MAX:
@@ -64,6 +65,8 @@ def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | No
     if suffix in GLTF:
         _check_gltf(path)
     parts = [_part(geometry, placed, texture) for geometry, placed in _load(path)]
+    if texture is not None and not any(part.images for part in parts):
+        raise ExchangeError(f"{path}: has no texture coordinates for the image given")
     mesh = _joined(path, parts)
     up = placing.up or ("y" if suffix in GLTF else "z")
     unit_mm = placing.unit_mm or (MM_PER_M if suffix in GLTF else 1.0)
@@ -131,7 +134,8 @@ def _corner_colours(visual: Any, faces: Any) -> Any:
         return np.asarray(visual.vertex_colors, np.uint8)[:, :3][faces]
     if kind == "face":
         return np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
-    return None
+    colour = getattr(getattr(visual, "material", None), "main_color", None)
+    return None if colour is None else np.broadcast_to(np.asarray(colour, np.uint8)[:3], (*faces.shape, 3))
 
 
 def _joined(path: Path, parts: list[Mesh]) -> Mesh:

@@ -20,6 +20,7 @@ from protocol.grid import VOID, BoolArray, FloatArray, Grid, GridSpec
 from tests.exchange.grids import grids, vase
 
 SIZE = (96, 50, 64, 40)
+untyped: Any = trimesh  # for what it has no types for
 
 
 def grey(corners: FloatArray) -> Mesh:
@@ -184,8 +185,7 @@ def test_the_axis_that_points_up_is_up(up: str, tmp_path: Path) -> None:
     cone = trimesh.creation.cone(10, 50)  # its point at z = 50
     towards = np.zeros(3)
     towards[axis] = sign
-    turn: Any = trimesh.geometry.align_vectors  # untyped
-    cone.apply_transform(turn([0, 0, 1], towards))
+    cone.apply_transform(untyped.geometry.align_vectors([0, 0, 1], towards))
     cone.export(tmp_path / "cone.stl")
     mesh = read_mesh(tmp_path / "cone.stl", Placing(up=up))
     radius = np.hypot(mesh.corners[..., 0], mesh.corners[..., 1])
@@ -215,6 +215,40 @@ def test_colours_of_faces_and_vertices_are_kept(tmp_path: Path) -> None:
         ball.export(tmp_path / "ball.ply")
         mesh = read_mesh(tmp_path / "ball.ply")
         assert (cast_mesh(mesh, fit_spec(mesh, SIZE)).texture == (10, 200, 30)).all()
+
+
+def test_a_material_s_plain_colour_is_kept(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(radius=0.005)
+    ball.visual = untyped.visual.TextureVisuals(
+        material=untyped.visual.material.PBRMaterial(baseColorFactor=[9, 99, 199])
+    )
+    ball.export(tmp_path / "ball.glb")
+    mesh = read_mesh(tmp_path / "ball.glb")
+    assert (cast_mesh(mesh, fit_spec(mesh, SIZE)).texture == (9, 99, 199)).all()
+
+
+def test_an_image_for_a_mesh_without_texture_coordinates_is_refused(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(radius=5).export(tmp_path / "ball.ply")
+    with pytest.raises(ExchangeError, match="no texture coordinates"):
+        read_mesh(tmp_path / "ball.ply", texture=np.zeros((4, 4, 3), np.uint8))
+
+
+def test_parts_stand_where_the_scene_puts_them_and_keep_their_own_textures(tmp_path: Path) -> None:
+    scene = untyped.Scene()
+    for name, height, colour in (("top", 0.03, 200), ("bottom", 0.0, 50)):
+        with open(tmp_path / f"{name}.glb", "w+b") as file:
+            spec = GridSpec(24, 6, 8, 4, step_mm=0.01, pitch_mm=5, z_max_mm=15)
+            colours = np.full((4, 8, 3), colour, np.uint8)
+            writer_of(".glb")(Grid(spec, np.full((6, 24), 3000, np.uint16), colours), file)
+        ((part, _),) = [
+            (scene_part, 0) for scene_part in trimesh.load_scene(tmp_path / f"{name}.glb").geometry.values()
+        ]
+        scene.add_geometry(part, name, transform=untyped.transformations.translation_matrix([0, height, 0]))
+    scene.export(tmp_path / "both.glb")
+    mesh = read_mesh(tmp_path / "both.glb")
+    grid = cast_mesh(mesh, GridSpec(24, 11, 24, 11, step_mm=0.01, pitch_mm=5, z_max_mm=42.5))
+    rows = grid.texture[:, 0, 0].tolist()
+    assert rows == [200] * 5 + [0] + [50] * 5 and (grid.range_steps[:5] == 3000).all()
 
 
 def _glb(path: Path, count: object) -> None:
