@@ -8,7 +8,7 @@ import socket
 import subprocess
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import pytest
 
 from client import NodeLost, connect
 from foveascan import PROGRAM, started
+from tests.system.line import RunningNode
 
 STOP_S = 5.0  # REQUIREMENTS AT-36
 WATCHDOG_S = 8.0
@@ -40,14 +41,25 @@ def serve(folder: Path, *more: str) -> list[str]:
     return ["serve", "--library", str(folder / "library"), "--listen", "127.0.0.1:0", "--insecure", "--json", *more]
 
 
+def text_frame(message: str) -> bytes:
+    """A WebSocket frame as clients send it, masked with zeros; up to 125 bytes."""
+    return bytes([0x81, 0x80 | len(message), 0, 0, 0, 0]) + message.encode()
+
+
 def deaf_client(url: str) -> socket.socket:
-    """A client that opens a stream and never reads what it is told."""
+    """A client that asks for more than its receive buffer holds and never reads what it is told."""
     host, _, port = url.removeprefix("http://").rpartition(":")
-    line = socket.create_connection((host, int(port)), timeout=5)
+    line = socket.socket()
+    line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    line.settimeout(5)
+    line.connect((host, int(port)))
     upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
     key = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: foveascan.v1\r\n"
     line.sendall(f"GET /v1/stream HTTP/1.1\r\nHost: {host}\r\n{upgrade}{key}\r\n".encode())
     assert line.recv(12) == b"HTTP/1.1 101"
+    line.sendall(text_frame('{"type":"hello","protocol":"foveascan.v1"}'))
+    for request in range(200):
+        line.sendall(text_frame(f'{{"type":"open","request":{request},"scan":"latest"}}'))
     return line
 
 
@@ -85,12 +97,22 @@ def test_a_node_that_cannot_listen_never_says_ready(tmp_path: Path) -> None:
             line.recv(4096)
 
 
+def test_sigterm_with_clients_that_do_not_read(line: Callable[..., RunningNode]) -> None:
+    node = line("--specimen", "sphere")
+    deaf = [deaf_client(node.url) for _ in range(2)]
+    began_s = time.monotonic()
+    node.process.terminate()
+    assert node.process.wait(STOP_S) == 0
+    assert time.monotonic() - began_s < STOP_S
+    for client in deaf:
+        client.close()
+
+
 async def test_sigterm_in_the_middle_of_a_sweep_tells_clients_and_publishes_nothing(tmp_path: Path) -> None:
     simulate = ["simulate", "--path", str(tmp_path / "tty"), "--link-rate", "100000", "--json"]
     with started(*simulate) as (_, link), started(*serve(tmp_path, "--scanner", link["path"])) as (node, ready):
         await ready_to_sweep(ready["url"])
         async with connect(ready["url"]) as session:
-            deaf = deaf_client(ready["url"])
             await session.start_sweep()
             began_s = 0.0
             async for frame in session.live():
@@ -102,7 +124,6 @@ async def test_sigterm_in_the_middle_of_a_sweep_tells_clients_and_publishes_noth
                 await anext(session.live())
             assert await asyncio.to_thread(node.wait, STOP_S) == 0
             assert time.monotonic() - began_s < STOP_S, time.monotonic() - began_s
-            deaf.close()
     with started(*serve(tmp_path)) as (_, ready):
         async with connect(ready["url"]) as session:
             assert await session.scans() == []
