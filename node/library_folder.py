@@ -131,7 +131,8 @@ def _finish_restore(folder: Path, staged: Path) -> str:
 
 def _is_restore(path: Path) -> bool:
     return path.is_dir() and all(
-        entry.removesuffix(NEW) == CHECKED or (SCAN_ID.fullmatch(entry) and _is_ours(path / entry)) for entry in os.listdir(path)
+        entry.removesuffix(NEW) == CHECKED or (SCAN_ID.fullmatch(entry) and _is_ours(path / entry))
+        for entry in os.listdir(path)
     )
 
 

@@ -1,7 +1,8 @@
 """A process for test_power_cut to kill: it forks at every line of its input, and the fork works until it is killed.
 
-Line: PHASE SEED LIBRARY DIARY. Answer: the number of the fork's process, and another line when it ended. What the fork has been promised by the library
-it writes into the diary, a line each, before it goes on; so the test knows what must be there after the cut.
+Line: PHASE SEED LIBRARY DIARY. Answer: the number of the fork's process, and another line when it ended. What the fork
+has been promised by the library it writes into the diary, a line each, before it goes on; so the test knows what must
+be there after the cut.
 """
 
 import os

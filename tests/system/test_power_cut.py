@@ -60,8 +60,8 @@ class Promises:
 @pytest.fixture
 def worker() -> Iterator[subprocess.Popen[str]]:
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, str(WORKER)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as process:
+    command, pipe = [sys.executable, str(WORKER)], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
         yield process
         assert process.stdin is not None
         process.stdin.close()
@@ -99,9 +99,7 @@ def fill(library: Library, seed: int) -> None:
         library.add(grid(seed), About(1e9))
 
 
-def cut(
-    worker: subprocess.Popen[str], phase: str, seed: int, folder: Path, diary: Path, after_s: float
-) -> None:
+def cut(worker: subprocess.Popen[str], phase: str, seed: int, folder: Path, diary: Path, after_s: float) -> None:
     """Have a process work in the library, and kill it some time after it has begun to."""
     assert worker.stdin is not None and worker.stdout is not None
     diary.touch()
