@@ -3,7 +3,7 @@
     formats     the one place to start: which suffix is which format, read and write by it
     mesh        the triangles of a grid, a band of rows at a time; glb, ply, obj, stl write them
     native      the grid itself as .npz, read and written without loss
-    mesh_file   triangles of anybody's mesh; cast turns them into a grid
+    mesh_file   triangles of anybody's mesh, or its points; cast and points turn them into a grid
     echo        Cyberware Echo range images
     image, whole_file, errors
 

@@ -84,21 +84,21 @@ class _Hits:
     weight: FloatArray
 
 
-def fit_spec(mesh: Mesh, size: tuple[int, int, int, int], theta0_rad: float = 0.0) -> GridSpec:
-    """The grid that holds the whole mesh. size : W, H, Wt, Ht. Raises ExchangeError for a mesh no grid can hold."""
-    if not len(mesh.corners):
-        raise ExchangeError("mesh: no triangles")
-    if not np.isfinite(mesh.corners).all():
-        raise ExchangeError("mesh: a vertex is not finite")
-    z_min_mm, z_max_mm = float(mesh.corners[..., 2].min()), float(mesh.corners[..., 2].max())
-    radius_mm = float(np.hypot(mesh.corners[..., 0], mesh.corners[..., 1]).max())
+def fit_spec(positions: FloatArray, size: tuple[int, int, int, int], theta0_rad: float = 0.0) -> GridSpec:
+    """The grid that holds every position (..., 3) [mm]. size : W, H, Wt, Ht. Raises ExchangeError when none can."""
+    if not positions.size:
+        raise ExchangeError("vertices: none")
+    if not np.isfinite(positions).all():
+        raise ExchangeError("vertices: a coordinate is not finite")
+    z_min_mm, z_max_mm = float(positions[..., 2].min()), float(positions[..., 2].max())
+    radius_mm = float(np.hypot(positions[..., 0], positions[..., 1]).max())
     step_mm = max(STEP_MIN_MM, radius_mm / (STEPS_MAX - 1))
     width, height, texture_width, texture_height = size
     try:
         pitch_mm = (z_max_mm - z_min_mm) / height
         return GridSpec(width, height, texture_width, texture_height, step_mm, pitch_mm, z_max_mm, theta0_rad)
     except ValueError as problem:
-        raise ExchangeError(f"mesh: its size makes no grid ({problem}); is its unit right?") from problem
+        raise ExchangeError(f"vertices: their extent makes no grid ({problem}); is the unit right?") from problem
 
 
 def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: None) -> Grid:
@@ -119,15 +119,15 @@ def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: Non
     texture = np.zeros((spec.texture_height, spec.texture_width, 3), np.uint8)
     for rows, hits in _cast(mesh, texels, lambda done: progress(share + (1 - share) * done)):
         texture[rows] = _colours(mesh, hits).reshape(-1, spec.texture_width, 3)
-    return Grid(spec, _steps(radius_mm, spec.step_mm), texture)
+    return Grid(spec, to_steps(radius_mm, spec.step_mm), texture)
 
 
-def _steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
+def to_steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
     """Ranges as steps. What is nearer to the axis than half a step stays measured, at one step."""
     try:
         return mm_to_steps(np.maximum(radius_mm, step_mm), step_mm)  # NaN stays NaN
     except ValueError as problem:
-        raise ExchangeError(f"mesh: {problem}") from problem
+        raise ExchangeError(f"vertices: {problem}") from problem
 
 
 def _cast(mesh: Mesh, lattice: _Lattice, progress: Progress) -> Iterator[tuple[slice, _Hits]]:

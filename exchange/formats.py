@@ -70,7 +70,7 @@ def read_scan(
     options: MeshOptions = MeshOptions(),
     progress: Callable[[float], object] = lambda share: None,
 ) -> tuple[str, Grid]:
-    """A scan and its name, from a grid (.npz), an Echo file (known by its content) or a mesh.
+    """A scan and its name, from a grid (.npz), an Echo file (known by its content), a mesh or points.
 
     texture_path : its colour; an Echo file takes the image of its own name beside it.  progress : share done, 0..1.
     Raises ExchangeError that names the file and the field at fault, OSError for a file that cannot be opened.
@@ -103,11 +103,15 @@ def _read_mesh(
 ) -> Grid:
     from exchange.cast import cast_mesh, fit_spec
     from exchange.mesh_file import SUFFIXES, Placing, read_mesh
+    from exchange.points import Points, bin_points
 
     if path.suffix.lower() not in SUFFIXES:
         raise ExchangeError(f"no scan: expected an Echo file, .npz, {', '.join(SUFFIXES)}")
-    mesh = read_mesh(path, options.placing or Placing(), texture)
-    return cast_mesh(mesh, fit_spec(mesh, options.size, options.theta0_rad), progress)
+    found = read_mesh(path, options.placing or Placing(), texture)
+    if isinstance(found, Points):
+        size = *options.size[:2], *options.size[:2]  # a point colours one texel: more of them would be gaps
+        return bin_points(found, fit_spec(found.positions, size, options.theta0_rad))
+    return cast_mesh(found, fit_spec(found.corners, options.size, options.theta0_rad), progress)
 
 
 def _image(path: Path | None) -> ImageArray | None:

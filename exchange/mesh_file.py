@@ -15,6 +15,7 @@ import trimesh
 
 from exchange.cast import Mesh
 from exchange.errors import ExchangeError
+from exchange.points import Points
 from protocol.grid import HEIGHT_MAX, WIDTH_MAX, FloatArray, ImageArray
 
 FILE_BYTES_MAX = 1 << 30
@@ -35,6 +36,7 @@ UP: Mapping[str, FloatArray] = MappingProxyType(
     }
 )
 GLTF = (".glb", ".gltf")
+Solid = trimesh.Trimesh | trimesh.PointCloud
 SUFFIXES = (*GLTF, ".obj", ".ply", ".stl", ".off")
 
 
@@ -52,8 +54,8 @@ class Placing:
     centred: bool = False
 
 
-def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | None = None) -> Mesh:
-    """The triangles of a file. texture : an image instead of the file's own.
+def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | None = None) -> Mesh | Points:
+    """The triangles of a file, or its points where it has none. texture : an image instead of the file's own.
 
     A face without texture has its corners', its own or its material's colour, and grey without any. Raises
     ExchangeError for a file that is no mesh we read, or one that stands beside the axis; OSError for one that cannot
@@ -64,18 +66,22 @@ def read_mesh(path: Path, placing: Placing = Placing(), texture: ImageArray | No
         raise ExchangeError(f"{path}: larger than {FILE_BYTES_MAX} bytes")
     if suffix in GLTF:
         _check_gltf(path)
-    parts = [_part(geometry, placed, texture) for geometry, placed in _load(path)]
+    up = UP[placing.up or ("y" if suffix in GLTF else "z")]
+    turn = up * (placing.unit_mm or (MM_PER_M if suffix in GLTF else 1.0))
+    found = _load(path)
+    parts = [_part(geometry, matrix, texture) for geometry, matrix in found if isinstance(geometry, trimesh.Trimesh)]
     if texture is not None and not any(part.images for part in parts):
         raise ExchangeError(f"{path}: has no texture coordinates for the image given")
+    if not parts:
+        points = _points(found)
+        return Points(_on_axis(path, points.positions @ turn.T, placing.centred), points.colours)
     mesh = _joined(path, parts)
-    up = placing.up or ("y" if suffix in GLTF else "z")
-    unit_mm = placing.unit_mm or (MM_PER_M if suffix in GLTF else 1.0)
-    corners = mesh.corners @ UP[up].T * unit_mm
-    return Mesh(_on_axis(path, corners, placing.centred), mesh.image, mesh.uv, mesh.colours, mesh.images)
+    corners = _on_axis(path, mesh.corners @ turn.T, placing.centred)
+    return Mesh(corners, mesh.image, mesh.uv, mesh.colours, mesh.images)
 
 
-def _load(path: Path) -> list[tuple[trimesh.Trimesh, FloatArray]]:
-    """Every mesh of a file, and the 4 x 4 matrix by which its scene places it."""
+def _load(path: Path) -> list[tuple[Solid, FloatArray]]:
+    """Every mesh and point cloud of a file, and the 4 x 4 matrix by which its scene places it."""
     try:
         scene = trimesh.load_scene(path, process=False)
         nodes = [scene.graph[name] for name in scene.graph.nodes_geometry]
@@ -84,17 +90,33 @@ def _load(path: Path) -> list[tuple[trimesh.Trimesh, FloatArray]]:
     except Exception as problem:  # readers of a dozen formats raise whatever comes to their mind over bad bytes
         raise ExchangeError(f"{path}: no mesh we can read: {type(problem).__name__}: {problem}") from problem
     placed = [(scene.geometry[name], np.asarray(matrix, np.float64)) for matrix, name in nodes]
-    found = [(geometry, matrix) for geometry, matrix in placed if isinstance(geometry, trimesh.Trimesh)]
-    faces = sum(len(geometry.faces) for geometry, _ in found)
-    if not 0 < faces <= FACES_MAX:
-        raise ExchangeError(f"{path}: faces: {faces}, expected 1 to {FACES_MAX}")
+    found = [(solid, matrix) for solid, matrix in placed if isinstance(solid, Solid) and _size(solid)]
+    size = sum(_size(solid) for solid, _ in found)
+    if not 0 < size <= FACES_MAX:
+        raise ExchangeError(f"{path}: {size} faces or points, expected 1 to {FACES_MAX}")
     return found
+
+
+def _size(solid: Solid) -> int:
+    return len(solid.faces if isinstance(solid, trimesh.Trimesh) else solid.vertices)
+
+
+def _points(found: list[tuple[Solid, FloatArray]]) -> Points:
+    """Point clouds as one; grey where they have no colours."""
+    positions = [np.asarray(cloud.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3] for cloud, matrix in found]
+    colours = [_point_colours(cloud) for cloud, _ in found]
+    return Points(np.concatenate(positions), np.concatenate(colours))
+
+
+def _point_colours(cloud: Any) -> ImageArray:
+    colours = np.asarray(cloud.colors)
+    if len(colours) == len(cloud.vertices):
+        return colours[:, :3].astype(np.uint8)
+    return np.full((len(cloud.vertices), 3), GREY, np.uint8)
 
 
 def _part(geometry: trimesh.Trimesh, placed: FloatArray, texture: ImageArray | None) -> Mesh:
     faces = np.asarray(geometry.faces)
-    if not faces.size:
-        return _coloured(np.zeros((0, 3, 3)), None, None, None)
     if faces.min() < 0 or faces.max() >= len(geometry.vertices):
         raise ExchangeError("faces: a vertex that does not exist")
     corners = (np.asarray(geometry.vertices, np.float64) @ placed[:3, :3].T + placed[:3, 3])[faces]
@@ -153,7 +175,7 @@ def _joined(path: Path, parts: list[Mesh]) -> Mesh:
 
 
 def _on_axis(path: Path, corners: FloatArray, centred: bool) -> FloatArray:
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     if centred:
         middle: FloatArray = (low + high) / 2 * (1, 1, 0)
         return np.subtract(corners, middle)

@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from exchange import cast
 from exchange.cast import Mesh, cast_mesh, fit_spec
 from exchange.errors import ExchangeError
-from exchange.formats import writer_of
+from exchange.formats import MeshOptions, read_scan, writer_of
 from exchange.mesh import GridMesh, Seam
-from exchange.mesh_file import Placing, read_mesh
+from exchange.mesh_file import Placing
+from exchange.mesh_file import read_mesh as read_anything
+from exchange.points import Points, bin_points
 from protocol.grid import VOID, BoolArray, FloatArray, Grid, GridSpec
 from tests.exchange.grids import grids, vase
 
@@ -27,6 +29,12 @@ def grey(corners: FloatArray) -> Mesh:
     m = len(corners)
     colours = np.full((m, 3, 3), 128, np.uint8)
     return Mesh(np.asarray(corners, np.float64), np.full(m, -1), np.zeros((m, 3, 2), np.float32), colours, ())
+
+
+def read_mesh(path: Path, *more: Any, **options: Any) -> Mesh:
+    mesh = read_anything(path, *more, **options)
+    assert isinstance(mesh, Mesh)
+    return mesh
 
 
 def triangles_of(grid: Grid) -> FloatArray:
@@ -114,17 +122,17 @@ def brute_force(corners: FloatArray, spec: GridSpec) -> tuple[FloatArray, BoolAr
 def test_batches_and_bands_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=40)
     mesh = grey(np.asarray(sphere.triangles))
-    at_once = cast_mesh(mesh, fit_spec(mesh, SIZE))
+    at_once = cast_mesh(mesh, fit_spec(mesh.corners, SIZE))
     monkeypatch.setattr(cast, "BAND_RAYS", 300)
     monkeypatch.setattr(cast, "BATCH_TRIALS", 50)
-    in_parts = cast_mesh(mesh, fit_spec(mesh, SIZE))
+    in_parts = cast_mesh(mesh, fit_spec(mesh.corners, SIZE))
     assert np.array_equal(at_once.range_steps, in_parts.range_steps)
     assert np.array_equal(at_once.texture, in_parts.texture)
 
 
 def test_a_sphere_is_a_sphere() -> None:
     mesh = grey(np.asarray(trimesh.creation.icosphere(subdivisions=5, radius=40).triangles))
-    grid = cast_mesh(mesh, fit_spec(mesh, SIZE))
+    grid = cast_mesh(mesh, fit_spec(mesh.corners, SIZE))
     height = grid.spec.height_mm(np.arange(grid.spec.height))
     expected = np.sqrt(40**2 - height**2)[:, None]
     assert np.abs(grid.range_mm - expected).max() < 0.08  # of the sphere, by 20,480 flat triangles
@@ -134,13 +142,13 @@ def test_a_sphere_is_a_sphere() -> None:
 def test_the_outermost_surface_is_seen() -> None:
     inner, outer = (trimesh.creation.cylinder(radius, 20, sections=64) for radius in (10, 30))
     mesh = grey(np.concatenate([np.asarray(outer.triangles), np.asarray(inner.triangles)]))
-    assert cast_mesh(mesh, fit_spec(mesh, SIZE)).range_mm.min() > 29.9
+    assert cast_mesh(mesh, fit_spec(mesh.corners, SIZE)).range_mm.min() > 29.9
 
 
 def test_a_surface_behind_the_axis_is_not_seen() -> None:
     wall = np.array([[[10.0, -5, -5], [10, 5, -5], [10, 0, 5]]])
     mesh = grey(wall)
-    grid = cast_mesh(mesh, fit_spec(mesh, (360, 20, 8, 8)))
+    grid = cast_mesh(mesh, fit_spec(mesh.corners, (360, 20, 8, 8)))
     seen = np.flatnonzero((grid.range_steps != VOID).any(axis=0))
     assert set(seen) <= {*range(27), *range(333, 360)} and len(seen) > 40
 
@@ -148,14 +156,14 @@ def test_a_surface_behind_the_axis_is_not_seen() -> None:
 def test_progress_ends_at_one() -> None:
     told: list[float] = []
     mesh = grey(np.asarray(trimesh.creation.icosphere().triangles))
-    cast_mesh(mesh, fit_spec(mesh, SIZE), told.append)
+    cast_mesh(mesh, fit_spec(mesh.corners, SIZE), told.append)
     assert told == sorted(told) and told[-1] == 1
 
 
 @pytest.mark.parametrize(
     ("corners", "message"),
     [
-        (np.zeros((0, 3, 3)), "no triangles"),
+        (np.zeros((0, 3, 3)), "none"),
         (np.full((1, 3, 3), np.inf), "finite"),
         (np.zeros((1, 3, 3)), "pitch_mm"),
         (np.arange(9.0).reshape(1, 3, 3) * 1e6, "pitch_mm"),
@@ -163,14 +171,14 @@ def test_progress_ends_at_one() -> None:
 )
 def test_a_mesh_no_grid_can_hold_is_refused(corners: FloatArray, message: str) -> None:
     with pytest.raises(ExchangeError, match=message):
-        fit_spec(grey(corners), SIZE)
+        fit_spec(corners, SIZE)
 
 
 def test_a_mesh_that_takes_too_long_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = grey(np.asarray(trimesh.creation.icosphere().triangles))
     monkeypatch.setattr(cast, "TRIALS_MAX", 100)
     with pytest.raises(ExchangeError, match="1280 faces need"):
-        cast_mesh(mesh, fit_spec(mesh, SIZE))
+        cast_mesh(mesh, fit_spec(mesh.corners, SIZE))
 
 
 def test_a_mesh_no_ray_meets_is_refused() -> None:
@@ -214,7 +222,7 @@ def test_colours_of_faces_and_vertices_are_kept(tmp_path: Path) -> None:
         setattr(ball.visual, kind, [10, 200, 30, 255])
         ball.export(tmp_path / "ball.ply")
         mesh = read_mesh(tmp_path / "ball.ply")
-        assert (cast_mesh(mesh, fit_spec(mesh, SIZE)).texture == (10, 200, 30)).all()
+        assert (cast_mesh(mesh, fit_spec(mesh.corners, SIZE)).texture == (10, 200, 30)).all()
 
 
 def test_a_material_s_plain_colour_is_kept(tmp_path: Path) -> None:
@@ -224,7 +232,7 @@ def test_a_material_s_plain_colour_is_kept(tmp_path: Path) -> None:
     )
     ball.export(tmp_path / "ball.glb")
     mesh = read_mesh(tmp_path / "ball.glb")
-    assert (cast_mesh(mesh, fit_spec(mesh, SIZE)).texture == (9, 99, 199)).all()
+    assert (cast_mesh(mesh, fit_spec(mesh.corners, SIZE)).texture == (9, 99, 199)).all()
 
 
 def test_an_image_for_a_mesh_without_texture_coordinates_is_refused(tmp_path: Path) -> None:
@@ -283,3 +291,31 @@ def test_bytes_that_are_no_mesh_are_refused(suffix: str, content: bytes, tmp_pat
     (tmp_path / f"bad{suffix}").write_bytes(content)
     with pytest.raises(ExchangeError, match="bad"):
         read_mesh(tmp_path / f"bad{suffix}")
+
+
+def test_points_are_binned_to_the_cells_they_are_seen_in(tmp_path: Path) -> None:
+    grid = vase(holes=True)
+    mesh = GridMesh(grid, Seam.SHARED)
+    (band,) = mesh.bands()
+    cloud = untyped.PointCloud(np.concatenate([mesh.positions(band), mesh.positions(band) * (0.5, 0.5, 1)]))
+    cloud.colors = np.concatenate([mesh.colours(band), np.zeros_like(mesh.colours(band))])
+    cloud.export(tmp_path / "vase.ply")
+    points = read_anything(tmp_path / "vase.ply")
+    assert isinstance(points, Points)
+    back = bin_points(points, GridSpec(48, 30, 48, 30, 0.01, 1.5, 31.0, 0.4))
+    assert np.array_equal(back.range_steps != VOID, grid.range_steps != VOID)
+    assert np.abs(back.range_steps.astype(int) - grid.range_steps).max() <= 1
+    assert np.array_equal(back.texture[grid.range_steps != VOID], mesh.colours(band))
+    name, fitted = read_scan(tmp_path / "vase.ply", None, MeshOptions((48, 29, 9, 9), theta0_rad=0.4))
+    assert name == "vase" and fitted.texture.shape == (29, 48, 3)
+
+
+def test_a_range_grid_is_read_as_its_points(tmp_path: Path) -> None:
+    """The PLY dialect of Cyberware and Stanford: a grid of lists with one vertex or none."""
+    head = "ply\nformat ascii 1.0\nobj_info num_cols 2\nobj_info num_rows 2\nelement vertex 3\n"
+    head += "property float x\nproperty float y\nproperty float z\n"
+    head += "element range_grid 4\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "grid.ply").write_text(head + "10 0 0\n-10 0 5\n0 10 9\n1 0\n1 1\n0\n1 2\n")
+    points = read_anything(tmp_path / "grid.ply")
+    assert isinstance(points, Points) and points.positions.tolist() == [[10, 0, 0], [-10, 0, 5], [0, 10, 9]]
+    assert (points.colours == 128).all()
