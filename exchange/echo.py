@@ -4,7 +4,7 @@
     LGINCR, LTINCR  microradians between longitudes, micrometres between latitudes
     RSHIFT          a radius is its value shifted left by so many bits [micrometres]
     SPACE           CYLINDRICAL, or absent     THETA_RIGHTHAND  longitudes go counter-clockwise seen from above
-    NAME            what to call it
+    NAME            the subject; it stays behind, since names of scans are listed freely
 
 Then int16, big-endian, one longitude after the other, each from its lowest latitude up; 0x8000 = void. Longitude 0
 stands behind the subject and longitudes go clockwise unless THETA_RIGHTHAND says otherwise. A colour image beside the
@@ -29,7 +29,6 @@ GREY = 128
 UM_PER_MM, URAD_PER_RAD = 1000, 1_000_000
 INCREMENT_MAX = 10_000_000
 SHIFT_MAX = 15
-NAME_MAX = 200
 
 
 def is_echo(head: bytes) -> bool:
@@ -37,8 +36,8 @@ def is_echo(head: bytes) -> bool:
     return HEADER_END in head
 
 
-def read_echo(file: BinaryIO, texture: ImageArray | None = None) -> tuple[str, Grid]:
-    """A grid and its name. texture : its colour image, (Ht, Wt, 3) uint8 RGB; without one it is grey.
+def read_echo(file: BinaryIO, texture: ImageArray | None = None) -> Grid:
+    """A grid. texture : its colour image, (Ht, Wt, 3) uint8 RGB; without one it is grey.
 
     Longitudes that are missing to a full turn are void. Raises ExchangeError that names the field at fault.
     """
@@ -57,7 +56,7 @@ def read_echo(file: BinaryIO, texture: ImageArray | None = None) -> tuple[str, G
     clockwise = "THETA_RIGHTHAND" not in fields
     if clockwise:
         steps, colour = np.ascontiguousarray(steps[:, ::-1]), np.ascontiguousarray(colour[:, ::-1])
-    return fields.get("NAME", "")[:NAME_MAX], Grid(_spec(fields, steps, colour, clockwise), steps, colour)
+    return Grid(_spec(fields, steps, colour, clockwise), steps, colour)
 
 
 def _fields(head: bytes) -> Mapping[str, str]:

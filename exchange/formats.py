@@ -94,7 +94,7 @@ def _read(
         if path.suffix.lower() == ".npz":
             return read_native(file, _image(texture_path))
         if is_echo(head):
-            return read_echo(file, _image(texture_path or _image_beside(path)))
+            return "", read_echo(file, _image(texture_path or _image_beside(path)))
     return "", _read_mesh(path, _image(texture_path), options, progress)
 
 
