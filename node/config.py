@@ -30,7 +30,8 @@ def _split_listen(listen: str) -> tuple[str, int]:
     return match[1] or match[2], int(match[3])
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a host."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -52,11 +53,12 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
     insecure: bool = False  # plain HTTP without login, on loopback only
     max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
     client_queue: Annotated[int, Meta(ge=1, le=256)] = 8  # messages waiting for one client
+    shared_cache: bool = False  # let caches in between keep foveae, for a day at most: only where they are yours
     encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode
 
     def __post_init__(self) -> None:
         host, _ = _split_listen(self.listen)
-        if self.insecure and not _is_loopback(host):
+        if self.insecure and not is_loopback(host):
             raise ValueError(f"insecure: without login only loopback is served, not {host}; listen on 127.0.0.1")
 
     @property

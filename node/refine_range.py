@@ -62,7 +62,12 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
     Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
     Raises LatticeError for a spacing that does not fit the scan.
     """
-    found = select_range(state, region, wanted)
+    return code_range_lattice(scan, state, range_lattice(region, wanted), wanted.quantum)
+
+
+def code_range_lattice(scan: Scan, state: ClientState, parameters: Parameters, quantum: int) -> Coded | None:
+    """The same for a lattice that is given."""
+    found = _select(state, parameters, quantum)
     if found is None:
         return None
     selection, adopted, quantum = found
@@ -79,9 +84,15 @@ def select_range(
     state: ClientState, region: Region, wanted: RangeParameters
 ) -> tuple[Selection, BoolArray, int] | None:
     """What code_range would carry: the selection, the adopted blocks of its lattice, the quantum; None: nothing."""
+    return _select(state, range_lattice(region, wanted), wanted.quantum)
+
+
+def _select(
+    state: ClientState, parameters: Parameters, quantum: int
+) -> tuple[Selection, BoolArray, int] | None:
     held = state.holdings.channels[Channel.RANGE]
-    lattice = build_lattice(held.shape, range_lattice(region, wanted))
-    quantum = min(wanted.quantum, _best_held(held, lattice))
+    lattice = build_lattice(held.shape, parameters)
+    quantum = min(quantum, _best_held(held, lattice))
     found = select(lattice, held, range_rank(quantum))
     return (*found, quantum) if found else None
 

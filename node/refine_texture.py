@@ -52,24 +52,38 @@ def code_texture(
     Where a block that would become finer is held at a better quality, the whole refinement takes that one (F-09c).
     Raises LatticeError for a spacing that does not fit, CodecError for a quality the codec does not have.
     """
-    found, quality = select_texture(state, region, wanted)
+    return code_texture_lattice(
+        scan, state, texture_lattice(region, wanted), wanted.quality, CODECS[wanted.codec], quick=quick
+    )
+
+
+def code_texture_lattice(
+    scan: Scan, state: ClientState, parameters: Parameters, quality: int, codec: TextureCodec, *, quick: bool = False
+) -> Coded | None:
+    """The same for a lattice that is given."""
+    found, best = _select(state, parameters, quality)
     if found is None:
         return None
-    codec = CODECS[wanted.codec]
-    if quality != wanted.quality and quality > quality_bounds(wanted.codec)[1]:
+    if best > quality and codec is TextureCodec.JPEG and best > JPEG_QUALITY_MAX:
         codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
-    payload = encode_texture(texture_samples(scan, found[0]), codec, quality, quick=quick)
-    return Coded(*found, texture_rank(quality), quality, codec, payload)
+    payload = encode_texture(texture_samples(scan, found[0]), codec, best, quick=quick)
+    return Coded(*found, texture_rank(best), best, codec, payload)
 
 
 def select_texture(
     state: ClientState, region: Region, wanted: TextureParameters
 ) -> tuple[tuple[Selection, BoolArray] | None, int]:
     """What code_texture would carry (the selection and the adopted blocks of its lattice; None: nothing), how good."""
+    return _select(state, texture_lattice(region, wanted), wanted.quality)
+
+
+def _select(
+    state: ClientState, parameters: Parameters, quality: int
+) -> tuple[tuple[Selection, BoolArray] | None, int]:
     held = state.holdings.channels[Channel.TEXTURE]
-    lattice = build_lattice(held.shape, texture_lattice(region, wanted))
-    quality = max(wanted.quality, _best_held(held, lattice))
-    return select(lattice, held, texture_rank(quality)), quality
+    lattice = build_lattice(held.shape, parameters)
+    best = max(quality, _best_held(held, lattice))
+    return select(lattice, held, texture_rank(best)), best
 
 
 def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:

@@ -20,6 +20,7 @@ from node.first_view import scan_info
 from node.library import ScanSummary
 from node.live import Live
 from node.page import Page
+from node.shared import SharedFoveae
 from protocol import messages as m
 from protocol.errors import LibraryError
 
@@ -52,6 +53,7 @@ class NodeServer:
         self._live = live
         self._capture = capture
         self._auth = Auth(config.server)
+        self._shared = SharedFoveae(exhibits, shared_cache=config.server.shared_cache)
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._app = web.Application(middlewares=[self._auth.admit, _explain], client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.append(_harden)
@@ -64,6 +66,7 @@ class NodeServer:
             web.get("/v1/scans/{scan}/coarse", self._coarse),
             web.post("/v1/sweeps", self._sweep),
             web.get("/v1/stream", self._stream),
+            *self._shared.routes(),
         ])  # fmt: skip
         self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=REQUESTS_S)
 
@@ -101,7 +104,9 @@ class NodeServer:
 
     async def _node(self, request: web.Request) -> web.Response:
         problems = [asdict(problem) for problem in self._exhibits.library.problems]
-        return _json({**msgspec.to_builtins(self._info), "capture": self._capture_status(), "problems": problems})
+        node = msgspec.to_builtins(self._info)
+        status = {"capture": self._capture_status(), "sharedEncodes": self._shared.encodes}
+        return _json({**node, **status, "problems": problems})
 
     async def _scans(self, request: web.Request) -> web.Response:
         return _json([_summary(scan) for scan in self._exhibits.library.scans()])
@@ -115,7 +120,7 @@ class NodeServer:
         codec: m.CodecName = "jpeg" if request.query.get("codec") == "jpeg" else "htj2k"
         _, view = await self._exhibits.open(request.match_info["scan"], codec)
         body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
-        return web.Response(body=body, content_type="application/octet-stream")
+        return web.Response(body=body, content_type="application/octet-stream", headers=self._shared.cache_headers)
 
     async def _sweep(self, request: web.Request) -> web.Response:
         require(request, "operate")

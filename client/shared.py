@@ -1,0 +1,96 @@
+"""A viewer without a session: first view and foveae by plain HTTP, which caches in between may share.
+
+The node knows nothing of such a viewer. What comes is planned over the first view alone, and adopted where it is finer
+than what the model holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import aiohttp
+import msgspec
+
+from client.errors import NodeLost, RequestRefused
+from client.model import Model
+from protocol.errors import RemoteWireError
+from protocol.messages import ScanInfo
+from protocol.refinement import Refinement
+
+BODY_MAX_BYTES = 64 << 20
+LENGTH_BYTES = 4
+
+
+class SharedViewer:
+    """See `open_shared`. model : as Session's; hits : answers that a cache says it gave."""
+
+    def __init__(self, http: aiohttp.ClientSession, url: str, model: Model) -> None:
+        self.model = model
+        self.hits = 0
+        self._http = http
+        self._url = url
+
+    async def look(self, u: float, v: float, **asked: float | str) -> int:
+        """Refine round (u, v). Returns the bytes received.
+
+        asked : window, texture_db, range_mm, max_bytes, alpha, scale, codec, as for Session.look.
+        """
+        place = f"{self._url}/v1/scans/{self.model.info.id}/fovea"
+        body = await self._body(place, {"u": u, "v": v, **asked})
+        for refinement in refinements_in(body):
+            self.model.apply(refinement)
+        return len(body)
+
+    async def _body(self, url: str, query: dict[str, Any]) -> bytes:
+        try:
+            async with self._http.get(url, params=query) as response:
+                body = await response.content.read(BODY_MAX_BYTES + 1)
+                if response.status != 200:
+                    raise RequestRefused(f"HTTP {response.status}", body[:500].decode(errors="replace"))
+                self.hits += response.headers.get("X-Cache-Status") == "HIT"
+        except (aiohttp.ClientError, OSError) as error:
+            raise NodeLost(f"lost {self._url}: {error}") from error
+        return body
+
+
+@asynccontextmanager
+async def open_shared(url: str, scan: str = "latest", codec: str = "htj2k") -> AsyncIterator[SharedViewer]:
+    """A viewer of one scan of the node (or the cache before it) at url, its first view in.
+
+    Raises NodeLost, RequestRefused, RemoteWireError.
+    """
+    async with aiohttp.ClientSession() as http:
+        viewer = SharedViewer(http, url.rstrip("/"), await _described(http, url.rstrip("/"), scan))
+        place = f"{viewer._url}/v1/scans/{viewer.model.info.id}/coarse"
+        for refinement in refinements_in(await viewer._body(place, {"codec": codec})):
+            viewer.model.apply(refinement)
+        yield viewer
+
+
+async def _described(http: aiohttp.ClientSession, url: str, scan: str) -> Model:
+    try:
+        async with http.get(f"{url}/v1/scans/{scan}") as response:
+            body = await response.content.read(BODY_MAX_BYTES)
+            if response.status != 200:
+                raise RequestRefused(f"HTTP {response.status}", body[:500].decode(errors="replace"))
+    except (aiohttp.ClientError, OSError) as error:
+        raise NodeLost(f"lost {url}: {error}") from error
+    try:
+        return Model(msgspec.json.decode(body, type=ScanInfo))
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise RemoteWireError(f"bad description of scan {scan}: {error}") from None
+
+
+def refinements_in(body: bytes) -> list[Refinement]:
+    """The refinements of an HTTP answer, each behind its length. Raises RemoteWireError."""
+    found, at = [], 0
+    while at < len(body):
+        size = int.from_bytes(body[at : at + LENGTH_BYTES], "little")
+        at += LENGTH_BYTES
+        if size > len(body) - at:
+            raise RemoteWireError("refinements are cut short")
+        found.append(Refinement.from_bytes(body[at : at + size]))
+        at += size
+    return found

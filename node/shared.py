@@ -1,0 +1,197 @@
+"""Foveae as plain HTTP, for many viewers of the same places: each a function of its URL, so that caches can share it.
+
+`GET .../fovea?u=..&v=..` plans over the first view alone and answers 303 to a canonical URL that names every parameter.
+What stands there never changes: refinements that say they are self-contained, of which a client adopts what is finer
+than what it holds. Requests for the same at the same time share one encode, and what was planned is kept for a while.
+
+    /v1/scans/{scan}/fovea/{epoch}/{range}/{texture}
+    range    p2.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quantum        or -
+    texture  p2.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quality.codec  or -
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from typing import Any, Generic, TypeVar
+
+import msgspec
+from aiohttp import web
+
+from node.auth import require
+from node.coded import Coded
+from node.exhibits import Exhibits
+from node.first_view import FirstView
+from node.foveate import plan_update
+from node.library import Scan
+from node.refine_range import code_range_lattice
+from node.refine_texture import CODECS, code_texture_lattice
+from protocol import messages as m
+from protocol.codec import TextureCodec
+from protocol.errors import CodecError, LatticeError
+from protocol.lattice import Channel, Parameters
+
+PLANS_KEPT = 1024
+BODIES_KEPT = 256
+MAX_AGE_S = 86400
+QUERY_KEYS = {"u", "v", "window", "texture_db", "range_mm", "max_bytes", "alpha", "scale", "codec"}
+NONE = "-"
+RANGE_NUMBERS, TEXTURE_NUMBERS = 8, 9
+
+T = TypeVar("T")
+
+
+class Once(Generic[T]):
+    """Results by key: made once however many ask at the same time, the latest `kept` of them kept."""
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
+        self._results: OrderedDict[str, asyncio.Task[T]] = OrderedDict()
+
+    async def get(self, key: str, make: Callable[[], Coroutine[Any, Any, T]]) -> T:
+        """The result for a key; what fails is forgotten."""
+        task = self._results.get(key)
+        if task is None:
+            task = self._results[key] = asyncio.create_task(make())
+            while len(self._results) > self._kept:
+                self._results.popitem(last=False)
+        self._results.move_to_end(key)
+        try:
+            return await asyncio.shield(task)
+        except Exception:
+            self._results.pop(key, None)
+            raise
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._results.clear()
+
+
+class SharedFoveae:
+    """The routes of self-contained foveae. shared_cache : whether answers may be kept by caches in between."""
+
+    def __init__(self, exhibits: Exhibits, *, shared_cache: bool) -> None:
+        self._exhibits = exhibits
+        self._shared_cache = shared_cache
+        self._epoch = secrets.token_hex(4)
+        self._plans: Once[str] = Once(PLANS_KEPT)
+        self._bodies: Once[bytes] = Once(BODIES_KEPT)
+        self.encodes = 0
+
+    @property
+    def cache_headers(self) -> dict[str, str]:
+        """What says whether and how long an answer may be kept."""
+        return {"Cache-Control": f"public, max-age={MAX_AGE_S}, immutable" if self._shared_cache else "no-store"}
+
+    def routes(self) -> list[web.RouteDef]:
+        """What to serve."""
+        return [
+            web.get("/v1/scans/{scan}/fovea", self._plan),
+            web.get("/v1/scans/{scan}/fovea/{epoch}/{range}/{texture}", self._serve),
+        ]
+
+    def void(self) -> None:
+        """A scan is gone: no URL given out so far leads anywhere any more."""
+        self._epoch = secrets.token_hex(4)
+        self._plans.clear()
+        self._bodies.clear()
+
+    async def _plan(self, request: web.Request) -> web.Response:
+        require(request, "view")
+        look, codec = _asked(request)
+        scan, view = await self._exhibits.open(request.match_info["scan"], codec)
+        key = f"{scan.id}?{request.query_string}"
+        place = await self._plans.get(key, partial(self._make_plan, scan, view, look, codec))
+        raise web.HTTPSeeOther(place)
+
+    async def _make_plan(self, scan: Scan, view: FirstView, look: m.Look, codec: m.CodecName) -> str:
+        model = self._exhibits.texture_model(scan)
+        job = partial(plan_update, scan, view.state, look, codec, look.max_bytes, lambda: False, model)
+        update = await self._exhibits.work(job)
+        place = canonical_path(scan.id, self._epoch, update.coded)
+        self.encodes += 1
+        await self._bodies.get(place, partial(_ready, body_of(update.coded)))
+        return place
+
+    async def _serve(self, request: web.Request) -> web.Response:
+        require(request, "view")
+        if request.match_info["epoch"] != self._epoch:
+            raise web.HTTPGone(text="the library has changed since: ask for the place again")
+        scan, view = await self._exhibits.open(request.match_info["scan"], "htj2k")
+        job = partial(_encode, scan, view, request.match_info["range"], request.match_info["texture"])
+        body = await self._bodies.get(request.path, partial(self._encode, job))
+        return web.Response(body=body, content_type="application/octet-stream", headers=self.cache_headers)
+
+    async def _encode(self, job: Callable[[], bytes]) -> bytes:
+        self.encodes += 1
+        try:
+            return await self._exhibits.work(job)
+        except (LatticeError, CodecError, ValueError) as error:
+            raise web.HTTPBadRequest(text=f"no such fovea: {error}") from None
+
+
+def canonical_path(scan_id: str, epoch: str, coded: tuple[Coded, ...]) -> str:
+    """The URL that stands for planned refinements, at most one a channel."""
+    parts = {"range": NONE, "texture": NONE}
+    for one in coded:
+        p = one.parameters
+        numbers = [p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y, one.quality]
+        is_range = one.channel is Channel.RANGE
+        parts[one.channel.name.lower()] = ".".join(map(str, numbers if is_range else [*numbers, int(one.codec)]))
+    return f"/v1/scans/{scan_id}/fovea/{epoch}/{parts['range']}/{parts['texture']}"
+
+
+def body_of(coded: tuple[Coded, ...]) -> bytes:
+    """Refinements one behind the other, each behind its length (u32, little-endian)."""
+    refinements = (
+        replace(one.refinement(0, seq, 0), self_contained=True).to_bytes() for seq, one in enumerate(coded)
+    )
+    return b"".join(len(data).to_bytes(4, "little") + data for data in refinements)
+
+
+def _encode(scan: Scan, view: FirstView, range_part: str, texture_part: str) -> bytes:
+    coded = []
+    if range_part != NONE:
+        *lattice, quantum = _numbers(range_part, RANGE_NUMBERS)
+        coded.append(code_range_lattice(scan, view.state, _parameters(*lattice), quantum))
+    if texture_part != NONE:
+        *lattice, quality, codec = _numbers(texture_part, TEXTURE_NUMBERS)
+        coded.append(code_texture_lattice(scan, view.state, _parameters(*lattice), quality, TextureCodec(codec)))
+    return body_of(tuple(one for one in coded if one is not None))
+
+
+def _parameters(p2: int, x: int, y: int, wide: int, high: int, rho_x: int, rho_y: int) -> Parameters:
+    return Parameters(p2, x, y, wide, high, rho_x, rho_y)
+
+
+def _numbers(text: str, count: int) -> list[int]:
+    numbers = [int(part) for part in text.split(".") if part.isascii() and part.isdigit() and len(part) <= 10]
+    if len(numbers) != count or ".".join(map(str, numbers)) != text:
+        raise ValueError(f"expected {count} numbers, got {text[:80]!r}")
+    return numbers
+
+
+def _asked(request: web.Request) -> tuple[m.Look, m.CodecName]:
+    """The look a query stands for. Raises 400 naming what is wrong with it."""
+    query = dict(request.query)
+    if unknown := query.keys() - QUERY_KEYS:
+        raise web.HTTPBadRequest(text=f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(sorted(QUERY_KEYS))}")
+    codec = query.pop("codec", "htj2k")
+    if codec not in CODECS:
+        raise web.HTTPBadRequest(text=f"codec must be one of {', '.join(CODECS)}")
+    camel = {"texture_db": "textureDb", "range_mm": "rangeMm", "max_bytes": "maxBytes"}
+    fields = {camel.get(key, key): value for key, value in query.items()}
+    try:
+        look = msgspec.convert({"type": "look", "request": 0, **fields}, m.Look, strict=False)
+    except msgspec.ValidationError as error:
+        raise web.HTTPBadRequest(text=f"fovea: {error}") from None
+    return look, codec  # type: ignore[return-value]
+
+
+async def _ready(body: bytes) -> bytes:
+    return body
+
