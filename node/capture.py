@@ -26,12 +26,12 @@ from drivers.scanner import (
     SweepReport,
     SweepStarted,
 )
-from node.assemble import Assembler
-from node.journal import Interrupted, Journal, Journals
-from node.resume import add_column, cut_lately, encoder_of, publish, resumed
-from protocol.errors import DriverError, FoveascanError, LibraryError, PortLost, RemoteWireError, ScannerFault
+from node.journal import Journals
+from node.resume import cut_lately, publish, resumed
+from node.running_sweep import RunningSweep
+from protocol.errors import DriverError, FoveascanError, LibraryError, PortLost
 from protocol.grid import Grid
-from protocol.scanner_messages import Column, DeviceInfo, RangeColumn, SweepHeader, SweepRequest, TextureColumn
+from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepRequest, TextureColumn
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +50,14 @@ class CaptureStatus:
     progress: float = 0.0
     sweeps: int = 0
     why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Resume:
+    """The order to go on with an interrupted sweep. by_itself : nobody asked, so the table must not turn anew."""
+
+    sweep_id: str
+    by_itself: bool = False
 
 
 class Capture:
@@ -78,7 +86,7 @@ class Capture:
         self._beat_s = time.monotonic()
         self._stop = threading.Event()
         self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
-        self._order: SweepRequest | str | None = None  # a new sweep, or the id of one to go on with
+        self._order: SweepRequest | _Resume | None = None
         self._port: Port | None = None
         self._status = CaptureStatus("connecting")
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
@@ -106,7 +114,7 @@ class Capture:
         if self._sweeps is None:
             raise LibraryError("this node keeps no interrupted sweeps")
         self._sweeps.get(sweep_id)
-        return self._request(sweep_id)
+        return self._request(_Resume(sweep_id))
 
     def stop(self, timeout_s: float = 3.0) -> None:
         """End a running sweep and the thread."""
@@ -115,7 +123,7 @@ class Capture:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def _request(self, order: SweepRequest | str) -> bool:
+    def _request(self, order: SweepRequest | _Resume) -> bool:
         with self._lock:
             if self._status.phase == "sweeping" or self._order is not None:
                 return False
@@ -156,7 +164,7 @@ class Capture:
             with self._lock:
                 self._port = port
             self._status = replace(self._status, phase="ready", why="")
-            self._go_on(scanner, info)
+            self._obey(scanner, info, self._cut_lately(info))
             while not self._stop.is_set():
                 self._beat()
                 if (order := self._take_order()) is not None:
@@ -168,53 +176,52 @@ class Capture:
                 self._port = None
             port.close()
 
-    def _take_order(self) -> SweepRequest | str | None:
+    def _take_order(self) -> SweepRequest | _Resume | None:
         with self._lock:
             order, self._order = self._order, None
             if order is not None:
                 self._status = replace(self._status, phase="sweeping", progress=0.0, why="")
             return order
 
-    def _go_on(self, scanner: Scanner, info: DeviceInfo) -> None:
-        """If this very scanner was cut off in the middle of a sweep just now, ask for the rest of it."""
+    def _cut_lately(self, info: DeviceInfo) -> _Resume | None:
+        """The order to go on with a sweep, if this very scanner was cut off in the middle of one just now."""
         sweep = self._sweeps and cut_lately(self._sweeps.interrupted(), info, time.time())
-        if self._sweeps is None or not sweep:
-            return
-        log.info("going on with sweep %s", sweep.id)
-        self._status = replace(self._status, phase="sweeping")
-        held = list(self._sweeps.columns(sweep.id))
-        self._run_sweep(scanner.resume(sweep.header, held, self._stop), info, (sweep, held))
+        return _Resume(sweep.id, by_itself=True) if sweep else None
 
-    def _obey(self, scanner: Scanner, info: DeviceInfo, order: SweepRequest | str) -> None:
+    def _obey(self, scanner: Scanner, info: DeviceInfo, order: SweepRequest | _Resume | None) -> None:
+        """Do what was asked. Raises DriverError."""
         try:
-            if isinstance(order, str):
-                self._resume(scanner, info, order)
-            else:
-                if self._sweeps is not None:
-                    self._sweeps.require_room()
-                self._run_sweep(scanner.sweep(order, self._stop), info, None)
+            match order:
+                case SweepRequest():
+                    if self._sweeps is not None:
+                        self._sweeps.require_room()
+                    self._run_sweep(scanner.sweep(order, self._stop), RunningSweep(self._sweeps, info))
+                case _Resume():
+                    self._resume(scanner, info, order)
         except LibraryError as error:
             self._end(str(error))
 
-    def _resume(self, scanner: Scanner, info: DeviceInfo, sweep_id: str) -> None:
-        """Go on with a sweep as somebody asked, or finish one that lacks nothing. Raises DriverError, LibraryError."""
+    def _resume(self, scanner: Scanner, info: DeviceInfo, order: _Resume) -> None:
+        """Go on with a sweep, or finish one that lacks nothing. Raises DriverError, LibraryError."""
         assert self._sweeps is not None
-        sweep = self._sweeps.get(sweep_id)
-        held = list(self._sweeps.columns(sweep_id))
+        sweep = self._sweeps.get(order.sweep_id)
+        self._status = replace(self._status, phase="sweeping", progress=sweep.held / sweep.expected)
+        held = list(self._sweeps.columns(sweep.id))
         if sweep.is_complete:
             publish(self._sweeps, sweep, self._deliver)
             self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+            return
+        if order.by_itself:
+            events = scanner.resume(sweep.header, held, self._stop)
         else:
-            self._run_sweep(resumed(scanner, info, sweep, held, self._stop), info, (sweep, held))
+            events = resumed(scanner, info, sweep, held, self._stop)
+        self._run_sweep(events, RunningSweep(self._sweeps, info, sweep.id, held))
 
-    def _run_sweep(
-        self, events: SweepEvents, info: DeviceInfo, before: tuple[Interrupted, list[Column]] | None
-    ) -> None:
-        """One sweep, from its header to the grid that it makes. before : what was kept of it, if it began before.
+    def _run_sweep(self, events: SweepEvents, running: RunningSweep) -> None:
+        """One sweep, from its header to the grid that it makes. Raises DriverError.
 
-        However it ends, its columns are a scan or an interrupted sweep then, and `watch` knows. Raises DriverError.
+        However it ends, its columns are a scan or an interrupted sweep then, and `watch` knows.
         """
-        running = _Running(self._sweeps, info, before)
         try:
             self._follow(events, running)
         except FoveascanError as error:
@@ -224,7 +231,7 @@ class Capture:
             if isinstance(error, DriverError):
                 raise
 
-    def _follow(self, events: SweepEvents, running: _Running) -> None:
+    def _follow(self, events: SweepEvents, running: RunningSweep) -> None:
         """Hand every event to whom it concerns. Raises FoveascanError."""
         with closing(events):
             for event in events:
@@ -232,7 +239,8 @@ class Capture:
                 match event:
                     case SweepStarted(header):
                         running.begin(header)
-                        self._show(event, *running.held)
+                        for shown in (event, *running.held):
+                            self._watch(shown)
                         continue
                     case RangeColumn() | TextureColumn():
                         running.take(event)
@@ -249,76 +257,6 @@ class Capture:
                         self._end(f"sweep interrupted: {reason}")
                 self._watch(event)
 
-    def _show(self, *events: SweepEvent) -> None:
-        for event in events:
-            self._watch(event)
-
     def _end(self, why: str) -> None:
         log.warning("%s", why)
         self._status = replace(self._status, phase="ready", progress=0.0, why=why)
-
-
-class _Running:
-    """A sweep on its way: every column goes to the journal, then to the assembler.
-
-    before : what was kept of it, if it began before.  held : the columns of that.
-    """
-
-    def __init__(
-        self, sweeps: Journals | None, info: DeviceInfo, before: tuple[Interrupted, list[Column]] | None
-    ) -> None:
-        self._sweeps = sweeps
-        self._info = info
-        self._before = before
-        self.held = before[1] if before else []
-        self._journal: Journal | None = None
-        self._assembler: Assembler | None = None
-
-    def begin(self, header: SweepHeader) -> None:
-        """Make room for it. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
-        try:
-            self._assembler = Assembler(header.spec, encoder_of(header))
-        except ValueError as error:
-            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
-        if self._sweeps is not None and self._before is not None:
-            self._journal = self._sweeps.reopen(self._before[0].id)
-        elif self._sweeps is not None:
-            self._journal = self._sweeps.begin(self._info, header, time.time())
-        for column in self.held:
-            self._assemble(column)
-
-    def take(self, column: Column) -> None:
-        """Keep a column. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
-        if self._journal is not None:
-            self._journal.add(column)
-        self._assemble(column)
-
-    def flush(self) -> None:
-        """See to it that what was taken gets to the disk. Raises LibraryError."""
-        if self._journal is not None:
-            self._journal.flush()
-
-    def finish(self, deliver: Callable[[Grid], None]) -> None:
-        """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
-        assert self._assembler is not None
-        self.flush()
-        grid = self._assembler.finish()
-        if self._journal is not None:
-            self._journal.close()
-        deliver(grid)
-        if self._journal is not None and self._sweeps is not None:
-            self._sweeps.remove(self._journal.id)
-            self._journal = None
-
-    def leave(self, why: str) -> None:
-        """It ended early: what was kept of it is an interrupted sweep from now on."""
-        if self._journal is not None and self._sweeps is not None:
-            self._sweeps.keep(self._journal, why)
-            self._journal = None
-
-    def _assemble(self, column: Column) -> None:
-        assert self._assembler is not None
-        try:
-            add_column(self._assembler, column)
-        except RemoteWireError as error:
-            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error

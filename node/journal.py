@@ -183,18 +183,25 @@ class Journals:
         """Go on with an interrupted one. Raises LibraryError, NoRoom."""
         sweep = self.get(sweep_id)
         require_room(self._folder, needed_bytes(sweep.header) - sweep.size_bytes + SPARE_BYTES, "going on")
+        self._unlist(sweep_id)
         try:
-            journal = Journal(self._path(sweep_id))
+            return Journal(self._path(sweep_id))
         except OSError as error:
+            self._sweeps[sweep_id] = sweep
             raise disk_error("cannot go on with the sweep", error) from error
-        del self._sweeps[sweep_id]
-        return journal
 
     def keep(self, journal: Journal, why: str) -> Interrupted:
         """Close the journal of a sweep that ended early: it is listed from now on, with all that was kept of it."""
         with suppress(LibraryError):  # whoever adds columns heard of a failing disk; here it is kept what fits
             journal.close(why)
-        return self._survey(self._path(journal.id))
+        try:
+            return self._survey(self._path(journal.id))
+        except OSError as error:
+            raise disk_error("cannot look at what was kept of the sweep", error) from error
+
+    def discard(self, journal: Journal) -> None:
+        """Remove a closed journal, because its scan is kept. Raises LibraryError."""
+        self._remove(journal.id)
 
     def columns(self, sweep_id: str) -> Iterator[Column]:
         """The columns of an interrupted sweep, each piece once; their samples lie in the file. Raises LibraryError."""
@@ -202,18 +209,24 @@ class Journals:
         for _, payload in read_records(_map(self._path(sweep_id))):
             yield from (column for column in _columns_in(payload) if ledger.take(column))
 
-    def remove(self, sweep_id: str) -> None:
-        """Delete a journal, because its scan is kept or because nobody wants it. Raises LibraryError."""
+    def delete(self, sweep_id: str) -> None:
+        """Delete an interrupted sweep. Raises LibraryError when there is none such."""
+        self._unlist(sweep_id)
+        self._remove(sweep_id)
+
+    def _unlist(self, sweep_id: str) -> None:
+        """Take a sweep off the list; of several threads that want it, one gets it. Raises LibraryError."""
+        if self._sweeps.pop(sweep_id, None) is None:
+            raise LibraryError(f"no interrupted sweep {sweep_id[:40]!r}")
+
+    def _remove(self, sweep_id: str) -> None:
         try:
             self._path(sweep_id).unlink()
             sync_folder(self._folder)
         except OSError as error:
-            raise disk_error(f"cannot delete sweep {sweep_id[:40]!r}", error) from error
-        self._sweeps.pop(sweep_id, None)
+            raise disk_error(f"cannot delete sweep {sweep_id}", error) from error
 
     def _path(self, sweep_id: str) -> Path:
-        if not _ID.fullmatch(sweep_id):
-            raise LibraryError(f"no interrupted sweep {sweep_id[:40]!r}")
         return self._folder / (sweep_id + SUFFIX)
 
     def _meet(self, path: Path) -> None:

@@ -125,7 +125,7 @@ class LibraryRoutes:
         require(request, "admin")
         sweep = self._interrupted(request)
         with _explained():
-            await asyncio.to_thread(self._library.sweeps.remove, sweep.id)
+            await asyncio.to_thread(self._library.sweeps.delete, sweep.id)
         return web.Response(status=204)
 
     async def _export_sweep(self, request: web.Request) -> web.StreamResponse:

@@ -86,7 +86,7 @@ def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Grid], None
     for column in sweeps.columns(sweep.id):
         add_column(assembler, column)
     deliver(assembler.finish())
-    sweeps.remove(sweep.id)
+    sweeps.delete(sweep.id)
 
 
 def encoder_of(header: SweepHeader) -> Encoder:

@@ -213,9 +213,9 @@ def test_a_sweep_that_had_not_begun_leaves_nothing(tmp_path: Path) -> None:
 def test_a_deleted_sweep_is_gone(tmp_path: Path) -> None:
     sweep_id = kept(tmp_path, columns()[:5])
     journals = Journals(tmp_path)
-    journals.remove(sweep_id)
+    journals.delete(sweep_id)
     assert list(tmp_path.iterdir()) == [] and journals.interrupted() == []
-    for use in (journals.get, journals.remove, journals.reopen, lambda name: list(journals.columns(name))):
+    for use in (journals.get, journals.delete, journals.reopen, lambda name: list(journals.columns(name))):
         for name in (sweep_id, "../library", "", "0" * 15 + "\0"):
             with pytest.raises(LibraryError):
                 use(name)
@@ -226,7 +226,7 @@ def test_columns_stay_readable_after_their_journal_is_removed(tmp_path: Path) ->
     sweep_id = kept(tmp_path, pieces)
     journals = Journals(tmp_path)
     held = list(journals.columns(sweep_id))
-    journals.remove(sweep_id)
+    journals.delete(sweep_id)
     assert as_bytes(held) == as_bytes(pieces)
 
 

@@ -130,7 +130,7 @@ def check_sweeps(library: Library, seed: int, promises: Promises) -> None:
     publish_complete(library.sweeps, deliver)
     for sweep in library.sweeps.interrupted():
         assert not sweep.is_complete
-        library.sweeps.remove(sweep.id)
+        library.sweeps.delete(sweep.id)
 
 
 def check_scans(library: Library, promises: Promises) -> None:

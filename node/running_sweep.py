@@ -1,0 +1,80 @@
+"""A sweep on its way from the scanner to a grid, or to the interrupted sweeps, whichever comes first."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+from node.assemble import Assembler
+from node.journal import Journal, Journals
+from node.resume import add_column, encoder_of
+from protocol.errors import RemoteWireError, ScannerFault
+from protocol.grid import Grid
+from protocol.scanner_messages import Column, DeviceInfo, SweepHeader
+
+
+class RunningSweep:
+    """A sweep on its way: every column goes to the journal, then to the assembler.
+
+    sweeps : where journals are; None: nothing is kept.  info : the scanner.
+    sweep_id, held : the interrupted sweep that goes on, and its columns; None and nothing for a new one.
+    """
+
+    def __init__(
+        self, sweeps: Journals | None, info: DeviceInfo, sweep_id: str | None = None, held: Sequence[Column] = ()
+    ) -> None:
+        self.held = held
+        self._sweeps = sweeps
+        self._info = info
+        self._sweep_id = sweep_id
+        self._journal: Journal | None = None
+        self._assembler: Assembler | None = None
+
+    def begin(self, header: SweepHeader) -> None:
+        """Make room for it. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
+        try:
+            self._assembler = Assembler(header.spec, encoder_of(header))
+        except ValueError as error:
+            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
+        if self._sweeps is not None and self._sweep_id is not None:
+            self._journal = self._sweeps.reopen(self._sweep_id)
+        elif self._sweeps is not None:
+            self._journal = self._sweeps.begin(self._info, header, time.time())
+        for column in self.held:
+            self._assemble(column)
+
+    def take(self, column: Column) -> None:
+        """Keep a column. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
+        if self._journal is not None:
+            self._journal.add(column)
+        self._assemble(column)
+
+    def flush(self) -> None:
+        """See to it that what was taken gets to the disk. Raises LibraryError."""
+        if self._journal is not None:
+            self._journal.flush()
+
+    def finish(self, deliver: Callable[[Grid], None]) -> None:
+        """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
+        assert self._assembler is not None
+        self.flush()
+        grid = self._assembler.finish()
+        if self._journal is not None:
+            self._journal.close()
+        deliver(grid)
+        if self._journal is not None and self._sweeps is not None:
+            self._sweeps.discard(self._journal)
+            self._journal = None
+
+    def leave(self, why: str) -> None:
+        """It ended early: what was kept of it is an interrupted sweep from now on."""
+        if self._journal is not None and self._sweeps is not None:
+            self._sweeps.keep(self._journal, why)
+            self._journal = None
+
+    def _assemble(self, column: Column) -> None:
+        assert self._assembler is not None
+        try:
+            add_column(self._assembler, column)
+        except RemoteWireError as error:
+            raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
