@@ -1,4 +1,4 @@
-"""The node's subcommands: `serve`."""
+"""The node's subcommands: `serve` and `doctor`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Offer `serve`."""
+    """Offer `serve` and `doctor`."""
     serve = subparsers.add_parser("serve", help="run the node: read the scanner, keep scans, serve clients")
     serve.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML); options here win over them")
     serve.add_argument("--library", metavar="DIR", help="folder the scans are kept in")
@@ -18,6 +18,13 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     serve.add_argument("--name", help="name to announce on the network (this host's)")
     serve.add_argument("--json", action="store_true", help="print one JSON object once the node is ready")
     serve.set_defaults(run=run_serve)
+
+    doctor = subparsers.add_parser("doctor", help="say what keeps a node from working here, and the cure")
+    doctor.add_argument("--config", type=Path, metavar="FILE", help="settings the node runs with (TOML)")
+    doctor.add_argument("--scanner", metavar="PATH", help="serial port of the scanner, instead of the one set there")
+    doctor.add_argument("--library", metavar="DIR", help="folder the scans are kept in, instead of the one set there")
+    doctor.add_argument("--json", action="store_true", help="print one JSON object a check")
+    doctor.set_defaults(run=run_doctor)
 
 
 def run_serve(args: argparse.Namespace) -> int:
@@ -48,3 +55,22 @@ def run_serve(args: argparse.Namespace) -> int:
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         runner.run(run_node(config, ready))
     return 0
+
+
+def run_doctor(args: argparse.Namespace) -> int:
+    """Print what each check finds; status 1 when one finds a problem."""
+    import json
+    from dataclasses import asdict
+
+    from node.doctor import examine
+
+    has_problem = False
+    for finding in examine(args.config, {"capture.scanner": args.scanner, "library.folder": args.library}):
+        has_problem |= finding.state == "problem"
+        if args.json:
+            print(json.dumps(asdict(finding)), flush=True)
+            continue
+        print(f"{finding.state:8} {finding.check:14} {finding.found}", flush=True)
+        if finding.cure:
+            print(f"{'':23} cure: {finding.cure}", flush=True)
+    return int(has_problem)

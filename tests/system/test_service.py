@@ -129,6 +129,19 @@ async def test_sigterm_in_the_middle_of_a_sweep_tells_clients_and_publishes_noth
             assert await session.scans() == []
 
 
+def test_the_doctor_hears_the_node(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    settings = tmp_path / "node.toml"
+    library = f"[library]\nfolder = \"{tmp_path}/library\"\n"
+    settings.write_text(f"[server]\nlisten = \"127.0.0.1:{port}\"\ninsecure = true\n{library}")
+    doctor = [*PROGRAM, "doctor", "--config", str(settings)]
+    with started("serve", "--config", str(settings), "--json"):
+        told = subprocess.run(doctor, capture_output=True, text=True, timeout=60)
+    assert f"ok       server         a node answers at 127.0.0.1:{port}" in told.stdout
+    assert "warning  discovery      only this machine can reach and find it" in told.stdout
+
+
 async def test_kill_9_and_a_new_start_let_clients_go_on(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

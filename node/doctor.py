@@ -1,0 +1,247 @@
+"""What may keep a node from working on this machine: each check says what it found, and the cure.
+
+Nothing is changed, no lock is taken, and a port is opened only while no node uses it: a doctor may come at any time.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import http.client
+import os
+import shutil
+import socket
+import stat
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from node import config as settings
+from node.advertise import HEARD_S, is_heard
+from node.identity import node_identity
+from node.library import survey
+from node.machine import (
+    ACCOUNT,
+    READ,
+    SEARCH,
+    WRITE,
+    Account,
+    available_bytes,
+    group_name,
+    is_clock_synchronised,
+    node_account,
+    serial_ports,
+    written_last_s,
+)
+from protocol.errors import ConfigError, LibraryError
+
+RULE = "70-foveascan.rules"
+SWEEP_M_BYTES = 1440 * 1024 * 2 + 4096 * 2048 * 3
+SWEEP_L_BYTES = 4096 * 2048 * 2 + 8192 * 4096 * 3
+DISK_MIN_BYTES = 2 * SWEEP_L_BYTES  # a journal and the scan it becomes
+DISK_EASY_BYTES = 1 << 30
+MEMORY_BASE_BYTES, MEMORY_FACTOR = 150 << 20, 6  # issue 3: 6x the arrays of a scan, and this
+ANSWER_S = 2.0
+ANSWER_BYTES_MAX = 65536
+NAMED_MAX = 3
+
+State = Literal["ok", "warning", "problem"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What one check found. A warning is worth knowing; with a problem, the node does not do its work."""
+
+    check: str
+    state: State
+    found: str
+    cure: str = ""
+
+
+def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Finding]:
+    """Every check, one after the other. path, overrides : as for load_config."""
+    try:
+        config = settings.load_config(path, overrides)
+        library = config.library.path
+    except ConfigError as error:
+        yield Finding("configuration", "problem", str(error), "correct the setting named; the rest was not looked at")
+        return
+    yield Finding("configuration", "ok", str(path) if path else "the defaults: no file was named")
+    account, port = node_account(), config.capture.scanner
+    who = _who_answers(config.server)
+    yield check_port(port, is_used=who == "node")
+    yield check_permission(port, account)
+    yield check_server(config.server, who)
+    yield check_disk(library, account)
+    yield check_memory(available_bytes())
+    yield check_clock(time.time(), written_last_s(Path(__file__), library), is_clock_synchronised())
+    yield check_discovery(config, who == "node")
+    yield check_library(library)
+
+
+def check_port(port: str | None, *, is_used: bool = False) -> Finding:
+    """Whether the scanner's port is there and can be opened. is_used : a node has it open now."""
+    if port is None:
+        return Finding("port", "ok", "none is set: a library without a scanner", "capture.scanner, to sweep")
+    try:
+        info = os.stat(port)
+    except OSError as error:
+        there = ", ".join(serial_ports()) or "none"
+        cure = f"plug the scanner in and switch it on, or correct capture.scanner; ports here: {there}"
+        return Finding("port", "problem", f"{port}: {error.strerror}", cure)
+    if not stat.S_ISCHR(info.st_mode):
+        return Finding("port", "problem", f"{port} is no serial port", "correct capture.scanner")
+    if is_used:
+        return Finding("port", "ok", f"{port}, in use by the node")
+    return _opened(port)
+
+
+def _opened(port: str) -> Finding:
+    try:
+        handle = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except PermissionError:
+        return Finding("port", "ok", f"{port} is there; whether it works cannot be tried without permission")
+    except OSError as error:
+        return Finding("port", "problem", f"{port}: {error.strerror}", "unplug the scanner and plug it in again")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_terminal = os.isatty(handle)
+    except OSError:
+        cure = f"end the program that has it open: fuser -v {port}"
+        return Finding("port", "problem", f"{port} is in use by another program", cure)
+    finally:
+        os.close(handle)
+    if not is_terminal:
+        return Finding("port", "problem", f"{port} is no serial port", "correct capture.scanner")
+    return Finding("port", "ok", port)
+
+
+def check_permission(port: str | None, account: Account) -> Finding:
+    """Whether the node's account may read and write the port."""
+    if port is None or not os.path.exists(port):
+        return Finding("permission", "ok", "there is no port to open")
+    info = os.stat(port)
+    if account.may(info, READ | WRITE):
+        return Finding("permission", "ok", f"{account.name} may use {port}")
+    found = f"{account.name} may not use {port}, which belongs to the group {group_name(info.st_gid)}"
+    join = f"usermod -aG {ACCOUNT} {account.name}, then log in again"
+    if group_name(info.st_gid) == ACCOUNT:
+        return Finding("permission", "problem", found, join)
+    rule = f"install systemd/{RULE} as /etc/udev/rules.d/{RULE}; udevadm control --reload && udevadm trigger"
+    return Finding("permission", "problem", found, rule if account.name == ACCOUNT else f"{rule}; {join}")
+
+
+def check_server(server: settings.Server, who: str) -> Finding:
+    """Whether the address can be served. who : "node", "other" or "nobody" answers there."""
+    if who == "node":
+        return Finding("server", "ok", f"a node answers at {server.listen}")
+    if who == "other":
+        cure = "stop it, or choose another server.listen"
+        return Finding("server", "problem", f"another program listens at {server.listen}", cure)
+    try:
+        family = socket.AF_INET6 if ":" in server.host else socket.AF_INET
+        with socket.create_server((server.host, server.port), family=family):
+            return Finding("server", "ok", f"{server.listen} is free; no node runs there")
+    except OSError as error:
+        return Finding("server", "problem", f"{server.listen}: {error.strerror}", "correct server.listen")
+
+
+def check_disk(folder: Path, account: Account) -> Finding:
+    """Whether the library can be written, and holds another sweep of the largest size."""
+    there = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
+    if not there.is_dir() or not account.may(there.stat(), READ | WRITE | SEARCH):
+        cure = f"chown -R {account.name} {folder}, or choose another library.folder"
+        return Finding("disk", "problem", f"{account.name} may not write in {there}", cure)
+    if os.statvfs(there).f_flag & os.ST_RDONLY:
+        cure = "mount it anew, or choose another library.folder"
+        return Finding("disk", "problem", f"{there} is mounted read-only", cure)
+    free = shutil.disk_usage(there).free
+    found = f"{_size(free)} free in {there}"
+    if free < DISK_MIN_BYTES:
+        cure = f"free some space: a sweep of size L takes {_size(DISK_MIN_BYTES)} while it is kept"
+        return Finding("disk", "problem", found, cure)
+    if free < DISK_EASY_BYTES:
+        return Finding("disk", "warning", found, "back scans up and delete them here, or use a larger disk")
+    return Finding("disk", "ok", found)
+
+
+def check_memory(available: int) -> Finding:
+    """Whether scans of size M fit, and of size L. available : bytes."""
+    found = f"{_size(available)} available"
+    cure = "scans of size {} need {}: end other programs, or use a machine with more memory"
+    for_m, for_l = (MEMORY_FACTOR * arrays + MEMORY_BASE_BYTES for arrays in (SWEEP_M_BYTES, SWEEP_L_BYTES))
+    if available < for_m:
+        return Finding("memory", "problem", found, cure.format("M", _size(for_m)))
+    if available < for_l:
+        return Finding("memory", "warning", found, cure.format("L", _size(for_l)))
+    return Finding("memory", "ok", found)
+
+
+def check_clock(now_s: float, written_s: float, is_synchronised: bool | None) -> Finding:
+    """Whether the clock can be right. written_s : when something here was written that must be in the past."""
+    found = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now_s))
+    cure = "timedatectl set-ntp true, or set it by hand; scans keep their order all the same"
+    if now_s < written_s:
+        return Finding("clock", "problem", f"{found} is before what was written here last", cure)
+    if is_synchronised is False:
+        return Finding("clock", "warning", f"{found}, not synchronised", cure)
+    return Finding("clock", "ok", found)
+
+
+def check_discovery(config: settings.Config, is_running: bool) -> Finding:
+    """Whether others on the network can find the node."""
+    if not config.discovery.enabled:
+        return Finding("discovery", "ok", "switched off", "discovery.enabled = true, to be found")
+    try:
+        heard = is_heard(config.server.host, node_identity(config.library.path) if is_running else None)
+    except (OSError, LibraryError) as error:
+        cure = "connect a network, or set discovery.enabled = false"
+        return Finding("discovery", "problem", f"multicast DNS cannot be used: {error}", cure)
+    if not heard:
+        cure = "let UDP port 5353 through the firewall (ufw allow mdns), and restart the node"
+        return Finding("discovery", "problem", f"the node runs, but is not heard within {HEARD_S:g} s", cure)
+    if settings.is_loopback(config.server.host):
+        cure = "server.listen on the network's address"
+        return Finding("discovery", "warning", "only this machine can reach and find it", cure)
+    return Finding("discovery", "ok", "the node is heard" if is_running else "multicast DNS works; no node runs")
+
+
+def check_library(folder: Path) -> Finding:
+    """Whether the library can be read, and what lies in it that is no sound scan."""
+    if not os.path.exists(folder):
+        return Finding("library", "ok", f"{folder} is not there yet: the node makes it")
+    try:
+        known, problems = survey(folder)
+    except LibraryError as error:
+        return Finding("library", "problem", str(error), "choose another library.folder, or restore a backup")
+    found = f"{len(known)} scans in {folder}"
+    if not problems:
+        return Finding("library", "ok", found)
+    named = "; ".join(f"{problem.name}: {problem.reason}" for problem in problems[:NAMED_MAX])
+    cure = "they are left alone: move away what does not belong there, restore damaged scans from a backup"
+    return Finding("library", "warning", f"{found}, and {len(problems)} things that are none ({named})", cure)
+
+
+def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:
+    """Who listens at the node's address."""
+    if server.port == 0:
+        return "nobody"
+    line = http.client.HTTPConnection(server.host, server.port, timeout=ANSWER_S)
+    try:
+        line.request("GET", "/healthz")
+        answer = msgspec.json.decode(line.getresponse().read(ANSWER_BYTES_MAX))
+        return "node" if isinstance(answer, dict) and "capture" in answer else "other"
+    except OSError as error:
+        return "other" if error.errno is None or error.errno == errno.ECONNRESET else "nobody"
+    except (http.client.HTTPException, msgspec.DecodeError):
+        return "other"
+    finally:
+        line.close()
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"

@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import socket
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+import foveascan
+from node import config as settings
+from node import doctor, machine
+from node.doctor import Finding
+from node.library import About, Library
+from node.machine import Account
+from protocol.grid import Grid, GridSpec
+
+ROOT = Account("root", 0, frozenset({0}))
+STRANGER = Account("stranger", 4711, frozenset({4711}))
+
+
+def states(*findings: Finding) -> list[str]:
+    return [finding.state for finding in findings]
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    ends = pty.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+# Configuration
+
+
+def test_a_wrong_setting_is_named_and_ends_the_examination(tmp_path: Path) -> None:
+    (tmp_path / "node.toml").write_text("[capture]\nbaud = 1\n")
+    (finding,) = doctor.examine(tmp_path / "node.toml", {})
+    assert (finding.check, finding.state) == ("configuration", "problem")
+    assert "capture.baud" in finding.found and finding.cure
+
+
+def test_every_check_has_its_say(tmp_path: Path) -> None:
+    findings = list(doctor.examine(None, {"library.folder": str(tmp_path), "server.listen": "127.0.0.1:0"}))
+    assert [finding.check for finding in findings] == [
+        "configuration", "port", "permission", "server", "disk", "memory", "clock", "discovery", "library",
+    ]  # fmt: skip
+    assert all(finding.cure for finding in findings if finding.state != "ok")
+
+
+# Port and permission
+
+
+def test_a_port_that_is_there_is_fine(port: str) -> None:
+    assert doctor.check_port(port) == Finding("port", "ok", port)
+    assert states(doctor.check_port(None)) == ["ok"]
+
+
+def test_a_missing_port_names_those_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "serial_ports", lambda: ["/dev/ttyACM3"])
+    finding = doctor.check_port("/dev/ttyACM0")
+    assert (finding.state, finding.found) == ("problem", "/dev/ttyACM0: No such file or directory")
+    assert "/dev/ttyACM3" in finding.cure
+
+
+def test_a_port_that_another_program_uses_is_a_problem_unless_it_is_the_node(port: str) -> None:
+    with open(port, "rb", buffering=0) as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        busy = doctor.check_port(port)
+        assert (busy.state, port in busy.cure) == ("problem", True)
+        assert states(doctor.check_port(port, is_used=True)) == ["ok"]
+
+
+@pytest.mark.parametrize("path", ["/dev/null", __file__])
+def test_what_is_no_serial_port_is_a_problem(path: str) -> None:
+    assert states(doctor.check_port(path)) == ["problem"]
+
+
+def rights(mode: int, user: int = 0, group: int = 0) -> os.stat_result:
+    return cast(os.stat_result, SimpleNamespace(st_mode=mode, st_uid=user, st_gid=group))
+
+
+@pytest.mark.parametrize(
+    ("info", "may"),
+    [
+        (rights(0o660), False),
+        (rights(0o660, user=4711), True),
+        (rights(0o660, group=4711), True),
+        (rights(0o066, user=4711), False),
+        (rights(0o606, group=4711), False),
+        (rights(0o640, group=4711), False),
+        (rights(0o666), True),
+    ],
+)
+def test_rights_are_the_owners_the_groups_or_everybodys(info: os.stat_result, may: bool) -> None:
+    assert STRANGER.may(info, machine.READ | machine.WRITE) is may
+    assert ROOT.may(info, machine.READ | machine.WRITE)
+
+
+def test_without_permission_the_udev_rule_is_named(port: str) -> None:
+    os.chmod(port, 0o620)
+    finding = doctor.check_permission(port, STRANGER)
+    assert finding.state == "problem" and port in finding.found
+    assert "70-foveascan.rules" in finding.cure and "usermod -aG foveascan stranger" in finding.cure
+    service = doctor.check_permission(port, Account("foveascan", 4711, frozenset()))
+    assert "70-foveascan.rules" in service.cure and "usermod" not in service.cure
+
+
+def test_where_the_rule_works_the_group_is_what_lacks(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.chmod(port, 0o660)
+    monkeypatch.setattr(doctor, "group_name", lambda group_id: "foveascan")
+    finding = doctor.check_permission(port, STRANGER)
+    assert finding.cure == "usermod -aG foveascan stranger, then log in again"
+
+
+def test_permission_is_not_asked_for_where_there_is_no_port(port: str) -> None:
+    for place, account in ((None, STRANGER), ("/dev/nothing", STRANGER), (port, ROOT)):
+        assert states(doctor.check_permission(place, account)) == ["ok"]
+
+
+def test_root_examines_for_the_services_account(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = SimpleNamespace(pw_uid=995, pw_gid=995)
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr("pwd.getpwnam", lambda name: entry)
+    monkeypatch.setattr(os, "getgrouplist", lambda name, group: [995, 20])
+    assert machine.node_account() == Account("foveascan", 995, frozenset({995, 20}))
+
+
+# Server
+
+
+def server(port: int) -> settings.Server:
+    return settings.Server(listen=f"127.0.0.1:{port}")
+
+
+def answering(body: bytes) -> HTTPServer:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    return HTTPServer(("127.0.0.1", 0), Handler)
+
+
+@pytest.mark.parametrize(
+    ("body", "state"), [(b'{"status": "ready", "capture": {}}', "ok"), (b"<html>", "problem"), (b"[]", "problem")]
+)
+def test_a_node_at_its_address_is_fine_another_program_is_not(body: bytes, state: str) -> None:
+    with answering(body) as other:
+        thread = Thread(target=other.handle_request)
+        thread.start()
+        settled = server(other.server_port)
+        assert states(doctor.check_server(settled, doctor._who_answers(settled))) == [state]
+        thread.join()
+
+
+def test_a_program_that_says_nothing_is_another_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "ANSWER_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        assert doctor._who_answers(server(silent.getsockname()[1])) == "other"
+
+
+def test_a_free_address_is_fine_one_that_is_not_ours_is_a_problem() -> None:
+    assert states(doctor.check_server(server(0), "nobody")) == ["ok"]
+    assert states(doctor.check_server(settings.Server(listen="192.0.2.1:7345"), "nobody")) == ["problem"]
+
+
+# Disk, memory, clock
+
+
+def test_a_disk_is_judged_by_what_a_sweep_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for free in (doctor.DISK_MIN_BYTES - 1, doctor.DISK_EASY_BYTES - 1, doctor.DISK_EASY_BYTES):
+        monkeypatch.setattr("shutil.disk_usage", lambda place, free=free: SimpleNamespace(free=free))
+        found.append(doctor.check_disk(tmp_path / "not" / "there", ROOT))
+    assert states(*found) == ["problem", "warning", "ok"]
+    assert str(tmp_path) in found[0].found
+
+
+def test_a_folder_the_node_may_not_write_is_a_problem(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    finding = doctor.check_disk(tmp_path / "library", Account("foveascan", 4711, frozenset()))
+    assert finding.state == "problem" and "chown" in finding.cure
+
+
+def test_memory_is_judged_by_what_scans_take() -> None:
+    found = [doctor.check_memory(size << 20) for size in (200, 400, 2000)]
+    assert states(*found) == ["problem", "warning", "ok"]
+    assert "size M" in found[0].cure and "size L" in found[1].cure
+    assert machine.available_bytes() > 0
+
+
+def test_a_clock_before_what_was_written_last_is_a_problem() -> None:
+    assert states(
+        doctor.check_clock(1e9, 1e9 + 1, True),
+        doctor.check_clock(1e9, 1e9, False),
+        doctor.check_clock(1e9, 1e9, None),
+        doctor.check_clock(1e9, 1e9, True),
+    ) == ["problem", "warning", "ok", "ok"]
+    assert machine.written_last_s(Path("/nothing"), Path(__file__)) > 1e9
+    assert machine.is_clock_synchronised() in (True, False, None)
+
+
+# Discovery and library
+
+
+def config(folder: Path, *, enabled: bool = True) -> settings.Config:
+    discovery = settings.Discovery(enabled=enabled)
+    return settings.Config(library=settings.Library(folder=str(folder)), discovery=discovery)
+
+
+def test_discovery_says_what_it_is_worth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert states(doctor.check_discovery(config(tmp_path, enabled=False), False)) == ["ok"]
+    asked: list[str | None] = []
+
+    def is_heard(host: str, node_id: str | None) -> bool:
+        asked.append(node_id)
+        return node_id is None
+
+    monkeypatch.setattr(doctor, "is_heard", is_heard)
+    assert states(doctor.check_discovery(config(tmp_path), False)) == ["warning"]  # on loopback
+    unheard = doctor.check_discovery(config(tmp_path), True)
+    assert unheard.state == "problem" and "5353" in unheard.cure
+    assert asked == [None, (tmp_path / "node-id").read_text()]
+
+
+def test_no_network_is_a_problem_of_discovery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_network(host: str, node_id: str | None) -> bool:
+        raise OSError("no such device")
+
+    monkeypatch.setattr(doctor, "is_heard", no_network)
+    finding = doctor.check_discovery(config(tmp_path), False)
+    assert (finding.state, "no such device" in finding.found) == ("problem", True)
+
+
+def test_a_library_is_counted_and_what_does_not_belong_there_named(tmp_path: Path) -> None:
+    assert states(doctor.check_library(tmp_path / "none")) == ["ok"]
+    spec = GridSpec(16, 8, 32, 16, 0.01, 1.0)
+    library = Library(tmp_path)
+    library.add(Grid(spec, np.ones((8, 16), np.uint16), np.zeros((16, 32, 3), np.uint8)), About(1.0))
+    assert doctor.check_library(tmp_path) == Finding("library", "ok", f"1 scans in {tmp_path}")
+    (tmp_path / "holiday.jpg").touch()
+    finding = doctor.check_library(tmp_path)
+    assert finding.state == "warning" and "holiday.jpg" in finding.found
+
+
+def test_a_library_of_a_newer_version_is_a_problem(tmp_path: Path) -> None:
+    (tmp_path / "library.json").write_text('{"format": 999}')
+    assert states(doctor.check_library(tmp_path)) == ["problem"]
+
+
+# The command
+
+
+def test_the_command_prints_a_line_a_check_and_fails_where_there_is_a_problem(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["doctor", "--library", str(tmp_path), "--scanner", "/dev/nothing"]
+    assert foveascan.main(arguments) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.split()[:2] == ["problem", "port"] for line in lines)
+    assert any(line.startswith(" ") and "cure: plug the scanner in" in line for line in lines)
+    assert foveascan.main([*arguments, "--json"]) == 1
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {"check", "state", "found", "cure"} == set(records[0])
+    assert {record["check"]: record["state"] for record in records}["port"] == "problem"
