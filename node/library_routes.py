@@ -28,7 +28,7 @@ from node.durable import NoRoom
 from node.journal import Interrupted
 from node.library import Library, verify
 from node.partial import write_partial
-from node.sidecar import CHANGE_BYTES_MAX, Conflict, Sidecar, decode_changes
+from node.sidecar import Conflict, Sidecar, decode_changes
 from protocol.errors import LibraryError
 
 CHUNK_BYTES = 1 << 18
@@ -81,7 +81,7 @@ class LibraryRoutes:
         require(request, "operate")
         scan_id, revision = self._known(request), _revision(request)
         with _explained():
-            changes = decode_changes(await request.content.read(CHANGE_BYTES_MAX + 1))
+            changes = decode_changes(await request.read())
             by = self._who(request)[:100]
             return _said(await asyncio.to_thread(self._library.annotate, scan_id, changes, by, revision))
 
