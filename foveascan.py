@@ -32,6 +32,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -116,6 +117,25 @@ def add_own_subcommands(subparsers: argparse._SubParsersAction[argparse.Argument
     demo.add_argument("--once", action="store_true", help="look at three places, compare with the truth, and end")
     demo.add_argument("--json", action="store_true", help="with --once: print one JSON object")
     demo.set_defaults(run=run_demo)
+    add_bench(subparsers)
+
+
+def add_bench(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Offer `bench`, which lives beside the tests and so stays out of the wheel."""
+    bench = subparsers.add_parser("bench", help="measure speed, bytes and quality (in a checkout)")
+    if not (Path(__file__).parent / "tests" / "bench").is_dir():
+        bench.add_argument("ignored", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+        bench.set_defaults(run=run_no_bench)
+        return
+    from tests.bench.command import add_arguments, run_bench
+
+    add_arguments(bench)
+    bench.set_defaults(run=run_bench)
+
+
+def run_no_bench(args: argparse.Namespace) -> int:
+    """What an installed package says to `bench`. Raises FoveascanError."""
+    raise FoveascanError("bench is not part of the installed package: run it in a checkout, with `make bench`")
 
 
 def run_demo(args: argparse.Namespace) -> int:

@@ -32,7 +32,8 @@ from protocol.messages import CodecName, Look, LookParameters, Opened, RangePara
 from protocol.reconstruct import select
 from protocol.refinement import Refinement
 from protocol.region import region_round
-from tests.bench.scans import BenchScan, Skipped, load
+from simulators.specimen import GENERATORS, SIZES
+from tests.bench.scans import REAL, BenchScan, Skipped, load
 from tests.bench.timing import MEGABYTE, medians_s
 
 PAYLOAD_BYTES = 4096
@@ -41,6 +42,7 @@ STREAM_FRAMES = 8192
 WINDOW = 0.05
 QUALITY = 42  # reaches 40 dB on a skin-like texture
 FIRST_VIEW_BYTES = 32768
+CODECS: tuple[CodecName, ...] = ("jpeg", "htj2k")
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,11 @@ class Case:
         return Look(1, u, v, WINDOW, parameters=LookParameters(range_, texture))
 
 
-CASES = tuple(Case(codec, p) for codec in ("jpeg", "htj2k") for p in (1, 2))
+CASES = tuple(Case(codec, p) for codec in CODECS for p in (1, 2))
 
 
-def run(specimens: list[str], size: str, clicks: int, repeats: int) -> dict[str, Any]:
-    """Everything, on the first specimen that is there."""
-    scan = load(specimens[0], size)
+def run(scan: BenchScan, size: str, clicks: int, repeats: int) -> dict[str, Any]:
+    """Everything, on one scan; first views at every size that it has."""
     with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
         published = scan.published(Path(folder))
         return {
@@ -75,7 +76,7 @@ def run(specimens: list[str], size: str, clicks: int, repeats: int) -> dict[str,
             "after_last_column": after_last_column(scan.grid, repeats),
             "updates": [update(published, case, scan.clicks(1)[0], repeats) for case in CASES],
             "searched": searched(published, scan, clicks),
-            "first_view_bytes": first_views(specimens[0]),
+            "first_view_bytes": first_views(scan),
         }  # fmt: skip
 
 
@@ -130,7 +131,7 @@ def after_last_column(grid: Grid, repeats: int) -> dict[str, float]:
 
 def update(scan: Scan, case: Case, click: tuple[float, float], repeats: int) -> dict[str, Any]:
     """Planning, encoding and packing one update, and applying it, against OpenCV's JPEG of the same patch."""
-    view = build_first_view(scan, "htj2k", FIRST_VIEW_BYTES)
+    view = build_first_view(scan, case.codec, FIRST_VIEW_BYTES)
     look = case.look(*click)
     patch = texture_patch_sent(scan, view, look)
     whole_look = LookParameters(texture=look.parameters.texture if look.parameters else None)
@@ -166,25 +167,25 @@ def update(scan: Scan, case: Case, click: tuple[float, float], repeats: int) -> 
 def searched(published: Scan, scan: BenchScan, clicks: int) -> dict[str, Any]:
     """How many images the node encodes when it chooses the parameters itself."""
     encodes: dict[str, list[int]] = {}
-    for codec in ("jpeg", "htj2k"):
-        view = build_first_view(published, "htj2k", FIRST_VIEW_BYTES)
+    for codec in CODECS:
+        view = build_first_view(published, codec, FIRST_VIEW_BYTES)
         looks = [Look(1, u, v, WINDOW) for u, v in scan.clicks(clicks)]
         encodes[codec] = [plan_update(published, view.state, look, codec).encodes for look in looks]
     return {f"encodes_{codec}": counts for codec, counts in encodes.items()}
 
 
-def first_views(specimen: str) -> dict[str, dict[str, int] | str]:
+def first_views(scan: BenchScan) -> dict[str, dict[str, int] | str]:
     """First view at every size: bytes of its three messages, by codec."""
     sizes: dict[str, dict[str, int] | str] = {}
-    for size in ("S", "M", "L"):
+    for size in SIZES if scan.name in (*GENERATORS, *REAL) else (scan.size,):
         try:
-            scan = load(specimen, size)
+            sized = scan if size == scan.size else load(scan.name, size)
         except Skipped as reason:
             sizes[size] = str(reason)
             continue
         with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
-            published = scan.published(Path(folder))
-            sizes[size] = {codec: _view_bytes(published, codec) for codec in ("htj2k",)}
+            published = sized.published(Path(folder))
+            sizes[size] = {codec: _view_bytes(published, codec) for codec in CODECS}
     return sizes
 
 

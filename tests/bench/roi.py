@@ -21,7 +21,7 @@ from tests.bench.ours import Looked, look, node_with
 from tests.bench.rivals.contestants import RIVALS, bytes_for
 from tests.bench.rivals.exact_crop import crop_bytes
 from tests.bench.rivals.offer import Unreachable
-from tests.bench.scans import BenchScan, Skipped, load
+from tests.bench.scans import BenchScan, Skipped
 from tests.bench.target import Target, Window
 
 ASKED = {
@@ -31,11 +31,10 @@ LINKS_BYTES_S = {"1 Mbit/s": 125e3, "10 Mbit/s": 1.25e6, "100 Mbit/s": 12.5e6}
 
 
 def run(
-    specimens: Iterable[str], size: str, clicks: int, cache: Cache, rivals: Iterable[str] = tuple(RIVALS)
+    scans: list[BenchScan], size: str, clicks: int, cache: Cache, rivals: Iterable[str] = tuple(RIVALS)
 ) -> dict[str, Any]:
-    """Every scan that is there, every click, every rival that can run."""
+    """Every scan, every click, every rival that can run."""
     target = Target()
-    scans, skipped = available(specimens, size)
     ours = asyncio.run(_ours(scans, clicks, target))
     rows, missing = [], dict[str, str]()
     total = sum(len(looks) for looks in ours.values())
@@ -52,20 +51,9 @@ def run(
                 rows.append(row)
                 bar.update()
     return {
-        "size": size, "target": asdict(target), "clicks": clicks, "skipped": skipped, "missing": missing,
+        "size": size, "target": asdict(target), "clicks": clicks, "missing": missing,
         "rows": rows, "ratios": ratios(rows), "verified": all(row["ours"]["reached"] for row in rows),
     }  # fmt: skip
-
-
-def available(specimens: Iterable[str], size: str) -> tuple[list[BenchScan], dict[str, str]]:
-    """The scans that are there, and why the others are not."""
-    scans, skipped = [], {}
-    for specimen in specimens:
-        try:
-            scans.append(load(specimen, size))
-        except Skipped as reason:
-            skipped[specimen] = str(reason)
-    return scans, skipped
 
 
 def ratios(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -115,7 +103,7 @@ def told(record: dict[str, Any]) -> str:
             f" {ours['range_error_mm']:.3f} | {ours['texture_db']:.2f}{'' if ours['reached'] else ' MISSED'} |"
             f" {ours['node_ms']:.0f} | {ours['encodes']} | {times} |"
         )
-    lines += [f"skipped: {name}: {why}" for name, why in {**record["skipped"], **record["missing"]}.items()]
+    lines += [f"skipped: {name}: {why}" for name, why in record["missing"].items()]
     return "\n".join(lines)
 
 

@@ -40,7 +40,7 @@ def _offer(scan: BenchScan, window: Window, level: Level, chroma: str, near: int
     if q is None:
         return Offer(0, "")
     image, rect = _tiles(scan, window, level, tile)
-    size = len(_scan_data(encode_tiles(rect.of(image), tile, chroma, q)))
+    size = data_bytes(encode_tiles(rect.of(image), tile, chroma, q))
     return Offer(size, f"JPEG {chroma} Q {q}, tiles of {tile}, {level.name}")
 
 
@@ -78,11 +78,24 @@ def _tiles(scan: BenchScan, window: Window, level: Level, tile: int) -> tuple[Im
 
 
 def encode_tiles(image: np.ndarray, tile: int, chroma: str, q: int) -> list[bytes]:
-    """JPEG files, each with tiles of an image in one column, a restart interval a tile (edge tiles are padded)."""
+    """JPEG files with the tiles of an image (edge tiles are padded)."""
     height, width = (-(-side // tile) for side in image.shape[:2])
     padding = ((0, height * tile - image.shape[0]), (0, width * tile - image.shape[1]), (0, 0))
     padded = np.pad(image, padding, "edge") if padding != ((0, 0),) * 3 else image
-    column = padded.reshape(height, tile, width, tile, 3).swapaxes(1, 2).reshape(-1, tile, 3)
+    return encode_stack(padded.reshape(height, tile, width, tile, 3).swapaxes(1, 2).reshape(-1, tile, tile, 3), chroma, q)
+
+
+def decode_tiles(files: list[bytes], shape: tuple[int, ...], tile: int) -> ImageArray:
+    """The image again, without the padding."""
+    height, width = (-(-side // tile) for side in shape[:2])
+    stack = decode_stack(files, tile).reshape(height, width, tile, tile, 3)
+    return stack.swapaxes(1, 2).reshape(height * tile, width * tile, 3)[: shape[0], : shape[1]]
+
+
+def encode_stack(stack: np.ndarray, chroma: str, q: int) -> list[bytes]:
+    """JPEG files, each with tiles (n, tile, tile, 3) in one column, a restart interval a tile."""
+    tile = stack.shape[1]
+    column = stack.reshape(-1, tile, 3)
     flags = (
         cv2.IMWRITE_JPEG_QUALITY, q,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR, CHROMA[chroma],
@@ -96,18 +109,15 @@ def encode_tiles(image: np.ndarray, tile: int, chroma: str, q: int) -> list[byte
     ]
 
 
-def decode_tiles(files: list[bytes], shape: tuple[int, ...], tile: int) -> ImageArray:
-    """The image again, without the padding."""
+def decode_stack(files: list[bytes], tile: int) -> ImageArray:
+    """The tiles again. (n, tile, tile, 3) uint8"""
     columns = [cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR_RGB) for file in files]
-    column = np.concatenate([np.asarray(part) for part in columns])
-    height, width = (-(-side // tile) for side in shape[:2])
-    image = column.reshape(height, width, tile, tile, 3).swapaxes(1, 2).reshape(height * tile, width * tile, 3)
-    return np.asarray(image[: shape[0], : shape[1]], np.uint8)
+    return np.concatenate([np.asarray(part, np.uint8) for part in columns]).reshape(-1, tile, tile, 3)
 
 
-def _scan_data(files: list[bytes]) -> bytes:
+def data_bytes(files: list[bytes]) -> int:
     """Entropy-coded data alone; the two bytes of each restart marker stand for a tile's length."""
-    return b"".join(file[_data_start(file) :] for file in files)
+    return sum(len(file) - _data_start(file) for file in files)
 
 
 def _data_start(file: bytes) -> int:

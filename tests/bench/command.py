@@ -1,0 +1,120 @@
+"""The subcommand `bench`: which benchmark, on which scans, told how."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from protocol.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tests.bench.scans import BenchScan
+
+REPEATS = 9
+CACHE = Path(__file__).resolve().parents[2] / ".bench_cache"
+
+Told = tuple[dict[str, Any], str]
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """Run one benchmark and print its figures. Raises ConfigError where nothing can be measured."""
+    from tests.bench.conditions import conditions
+
+    scans, skipped = _scans(args)
+    record, told = BENCHES[args.name](args, scans)
+    record = {"bench": args.name, "conditions": conditions(), "skipped": skipped, **record}
+    lines = [told, "", *(f"skipped: {reason}" for reason in skipped), _where(record["conditions"])]
+    print(json.dumps(record) if args.json else "\n".join(lines), flush=True)
+    return 0
+
+
+def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:
+    """The scans asked for that are there, and why others are not. Raises ConfigError where none is."""
+    from tests.bench.scans import STANDARD, Skipped, load
+
+    specimens = tuple(args.specimen or (("head",) if args.name == "line" else STANDARD))
+    if args.texture and len(specimens) != 1:
+        raise ConfigError("bench: --texture goes with one --specimen FILE")
+    scans, skipped = [], []
+    for specimen in specimens:
+        try:
+            scans.append(load(specimen, args.size, args.texture))
+        except Skipped as reason:
+            skipped.append(str(reason))
+    if not scans:
+        raise ConfigError(f"bench: {'; '.join(skipped)}")
+    return scans, skipped
+
+
+def _line(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import line
+
+    record = line.run(scans[0], args.size, args.clicks, args.repeats)
+    return record, line.told(record)
+
+
+def _roi(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import plots, roi
+    from tests.bench.cache import Cache
+    from tests.bench.rivals.contestants import RIVALS
+
+    rivals = args.rival or tuple(RIVALS)
+    for rival in rivals:
+        if rival not in RIVALS:
+            raise ConfigError(f"bench: no rival {rival!r}; there are {', '.join(RIVALS)}")
+    record = roi.run(scans, args.size, args.clicks, Cache(args.cache), rivals)
+    if args.plots:
+        record["plots"] = [str(path) for path in plots.draw(scans, args.size, args.plots, Cache(args.cache))]
+    return record, roi.told(record)
+
+
+def _session(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import session
+    from tests.bench.cache import Cache
+
+    record = session.run(scans, args.size, Cache(args.cache))
+    return record, session.told(record)
+
+
+def _codec(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import codec
+
+    record = codec.run(scans, args.size, args.repeats)
+    return record, codec.told(record)
+
+
+def _rate(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import rate
+
+    record = rate.run(scans, args.size, args.clicks)
+    return record, rate.told(record)
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, list[BenchScan]], Told]] = {
+    "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate,
+}  # fmt: skip
+
+
+def _where(conditions: dict[str, Any]) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in conditions["versions"].items())
+    machine = f"{conditions['cores']} cores of {conditions['processor']}, load {conditions['load']}"
+    return f"{conditions['date']}, commit {conditions['commit']}, {machine}; Python {conditions['python']}, {versions}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What `foveascan bench` takes."""
+    parser.add_argument("name", nargs="?", choices=BENCHES, default="line", help="what to measure (line)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument(
+        "--specimen", action="append", metavar="NAME|FILE", help="a scan, again for more (the four of DESIGN 8)"
+    )
+    parser.add_argument("--texture", metavar="IMAGE", help="texture of a grid FILE")
+    parser.add_argument("--size", choices=("S", "M", "L"), default="M", help="size class (M)")
+    parser.add_argument("--clicks", type=int, default=5, metavar="N", help="foveae a scan (5)")
+    parser.add_argument("--repeats", type=int, default=REPEATS, metavar="N", help=f"of each timing ({REPEATS})")
+    parser.add_argument("--rival", action="append", metavar="NAME", help="roi: only these rivals")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="roi: write PNGs of bytes against quality")
+    parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help="where rivals' results are kept")
