@@ -68,7 +68,7 @@ def cut_lately(sweeps: Sequence[Interrupted], info: DeviceInfo, now_unix_s: floa
     return None
 
 
-def publish_complete(sweeps: Journals, deliver: Callable[[Grid], None]) -> list[str]:
+def publish_complete(sweeps: Journals, deliver: Callable[[Grid], object]) -> list[str]:
     """Make scans of the complete sweeps that a crash kept from becoming ones. Returns what was done, or went wrong."""
     said = []
     for sweep in filter(lambda sweep: sweep.is_complete, sweeps.interrupted()):
@@ -80,7 +80,7 @@ def publish_complete(sweeps: Journals, deliver: Callable[[Grid], None]) -> list[
     return said
 
 
-def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Grid], None]) -> None:
+def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Grid], object]) -> None:
     """Make a scan of one complete sweep. deliver : returns once it is durable. Raises FoveascanError, ValueError."""
     assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
     for column in sweeps.columns(sweep.id):
