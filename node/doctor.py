@@ -86,7 +86,7 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
 def check_port(port: str | None, *, is_used: bool = False) -> Finding:
     """Whether the scanner's port is there and can be opened. is_used : a node has it open now."""
     if port is None:
-        return Finding("port", "ok", "none is set: a library without a scanner", "capture.scanner, to sweep")
+        return Finding("port", "ok", "none is set: a library without a scanner", "set capture.scanner, to sweep")
     try:
         info = os.stat(port)
     except OSError as error:
@@ -195,7 +195,7 @@ def check_clock(now_s: float, written_s: float, is_synchronised: bool | None) ->
 def check_discovery(config: settings.Config, is_running: bool) -> Finding:
     """Whether others on the network can find the node."""
     if not config.discovery.enabled:
-        return Finding("discovery", "ok", "switched off", "discovery.enabled = true, to be found")
+        return Finding("discovery", "ok", "switched off", "set discovery.enabled = true, to be found")
     try:
         heard = is_heard(config.server.host, node_identity(config.library.path) if is_running else None)
     except (OSError, LibraryError) as error:
@@ -205,7 +205,7 @@ def check_discovery(config: settings.Config, is_running: bool) -> Finding:
         cure = "let UDP port 5353 through the firewall (ufw allow mdns), and restart the node"
         return Finding("discovery", "problem", f"the node runs, but is not heard within {HEARD_S:g} s", cure)
     if settings.is_loopback(config.server.host):
-        cure = "server.listen on the network's address"
+        cure = "set server.listen to an address of the network"
         return Finding("discovery", "warning", "only this machine can reach and find it", cure)
     return Finding("discovery", "ok", "the node is heard" if is_running else "multicast DNS works; no node runs")
 
