@@ -45,10 +45,9 @@ class Ledger:
     def __init__(self, header: SweepHeader) -> None:
         self._sweep = header.sweep
         self._tracks = {
-            (channel, pass_index): _Track(*header.shape(channel))
+            (channel, pass_index): _Track(columns, *header.shape(channel)[1:])
             for channel in (Channel.RANGE, Channel.TEXTURE)
-            if channel in header.channels
-            for pass_index in range(header.passes)
+            for pass_index, columns in enumerate(header.columns_in(channel))
         }
         self.expected = sum(len(track.held) for track in self._tracks.values())
         self.held = 0

@@ -2,7 +2,8 @@
 
 The encoder says where a column stands; the order in which columns come, and how often, does not matter. A column whose
 encoder count is the nearest one to an equal angle IS that angle's column, bit for bit. Any other angle is interpolated
-between the two columns round it. A turn with a hole is refused, never bridged.
+between the two columns round it. A turn with a hole is refused, never bridged. Angles seen in several turns are
+averaged; a turn in which the object stands elsewhere than in the first is left out, and the report says so.
 
 Source: REQUIREMENTS A.6 (ticks are resampled to W equal angles, a partial turn is never served as complete, holes keep
 their mask).
@@ -11,22 +12,32 @@ their mask).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from node.laps import OUTLIER_SIGMAS, average, difference_sigma, shift_between
+from node.repair import repair
+from node.scan_quality import ScanQuality, coverage_of, slip_matters, survey
 from protocol.errors import FoveascanError, RemoteWireError
-from protocol.grid import VOID, Grid, GridSpec, ImageArray, IntArray, StepArray
+from protocol.grid import VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray, StepArray
 
 COUNTS_MAX = 1 << 31
 COUNTS_PER_COLUMN_MIN = 2
-TURNS_KEPT = 2
+TURNS_KEPT = 2  # room at first; more is made as passes come
+TURNS_MAX = 66
 STRIP_COLUMNS = 64
 WEIGHT_BITS = 15
 WEIGHT_ONE = np.uint32(1 << WEIGHT_BITS)
+TOLERANCE_ROWS = 0.25  # ranges that differ by less than this part of a row's height are no outliers
+TOLERANCE_GREY = 24.0
+SIGMA_COLUMNS = 256  # are enough to tell the noise
+SLIP_COLUMNS = 512  # are enough to tell a slip
+SLIP_REACH_MIN = 8
+PROFILE_ROWS = 256
 
 WeightArray = NDArray[np.uint32]
 Samples = TypeVar("Samples", StepArray, ImageArray)
@@ -65,12 +76,21 @@ class Encoder:
             raise ValueError(f"direction must be 1 or -1, got {self.direction}")
 
     def tick(self, count: int) -> int:
-        """Counts from the left edge of column 0, in the direction of the columns, in [0, counts_per_turn)."""
-        return (count - self.zero_count) * self.direction % self.counts_per_turn
+        """Counts from the left edge of column 0, in the direction of the columns; it goes on counting past a turn."""
+        return (count - self.zero_count) * self.direction
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assembly:
+    """A finished sweep. filled : (H, W) range cells whose value is made up, being small holes."""
+
+    grid: Grid
+    filled: BoolArray
+    quality: ScanQuality
 
 
 class Assembler:
-    """Takes the columns of one turn in any order, whole or in pieces, and makes the grid once they are all there.
+    """Takes the columns of a sweep in any order, whole or in pieces, and makes the grid once they are all there.
 
     Raises ValueError when the encoder is too coarse for the grid.
     """
@@ -85,14 +105,15 @@ class Assembler:
         self._encoder = encoder
         steps = np.empty((TURNS_KEPT * spec.width, spec.height), np.uint16)  # memory is taken only as columns come
         texels = np.empty((TURNS_KEPT * spec.texture_width, spec.texture_height, 3), np.uint8)
-        self._range = _Columns("range", spec.width, steps, blend_range)
-        self._texture = _Columns("texture", spec.texture_width, texels, blend_texture)
+        tolerance = TOLERANCE_ROWS * spec.pitch_mm / spec.step_mm
+        self._range = _Columns("range", spec.width, steps, blend_range, tolerance)
+        self._texture = _Columns("texture", spec.texture_width, texels, blend_texture, TOLERANCE_GREY)
 
     def add_range_column(self, encoder_count: int, row0: int, samples: StepArray) -> None:
         """Take rows row0... of the range column at an encoder count. samples : (n,) uint16 steps, 0 = void.
 
         The last word on a sample counts. Raises RemoteWireError when the rows do not fit the column, or when the sweep
-        brings more distinct columns than two turns hold.
+        brings more columns than any sweep has.
         """
         self._range.add(self._encoder.tick(encoder_count), row0, samples)
 
@@ -102,24 +123,74 @@ class Assembler:
 
     def missing_range(self) -> IntArray:
         """Range columns of the grid that nothing complete stands at or close enough round. (n,) ascending."""
-        return self._range.resampling(self._encoder.counts_per_turn).missing
+        return self._range.folded(self._encoder.counts_per_turn).missing
 
     def missing_texture(self) -> IntArray:
         """Texture columns of the grid that nothing complete stands at or close enough round. (n,) ascending."""
-        return self._texture.resampling(self._encoder.counts_per_turn).missing
+        return self._texture.folded(self._encoder.counts_per_turn).missing
 
     def finish(self) -> Grid:
-        """The sweep as a grid of equal angles. Raises IncompleteTurn."""
+        """The sweep as a grid of equal angles, averaged where it was seen more than once. Raises IncompleteTurn."""
+        return self._average()[0]
+
+    def assembly(self) -> Assembly:
+        """The grid without spikes and small holes, and what there is to say about it. Raises IncompleteTurn."""
+        grid, quality = self._average()
+        repaired = repair(grid, quality.noise_mm or 0.0)
+        found = survey(repaired.grid)
+        filled = int(repaired.filled.sum())
+        return Assembly(
+            repaired.grid,
+            repaired.filled,
+            replace(
+                quality,
+                coverage=coverage_of(np.where(repaired.filled, np.uint16(VOID), repaired.grid.range_steps)),
+                spikes=repaired.spikes,
+                filled=filled,
+                holes=found.holes,
+                dead_rows=found.dead_rows,
+                saturated_columns=found.saturated_columns,
+            ),
+        )
+
+    def _average(self) -> tuple[Grid, ScanQuality]:
         counts = self._encoder.counts_per_turn
-        range_plan, texture_plan = self._range.resampling(counts), self._texture.resampling(counts)
-        if range_plan.missing.size or texture_plan.missing.size:
-            raise IncompleteTurn(range_plan.missing, texture_plan.missing)
+        missing = self.missing_range(), self.missing_texture()
+        if missing[0].size or missing[1].size:
+            raise IncompleteTurn(*missing)
         s = self._spec
+        range_laps, texture_laps = self._range.laps(counts), self._texture.laps(counts)
+        slips = self._slips_deg(range_laps, texture_laps)
+        moved = {lap for lap, (_, matters) in slips.items() if matters}
         range_steps = np.empty((s.height, s.width), np.uint16)
         texture = np.empty((s.texture_height, s.texture_width, 3), np.uint8)
-        self._range.resample(range_plan, range_steps)
-        self._texture.resample(texture_plan, texture)
-        return Grid(s, range_steps, texture)
+        range_used = {lap: plan for lap, plan in range_laps.items() if lap not in moved}
+        texture_used = {lap: plan for lap, plan in texture_laps.items() if lap not in moved}
+        rejected = self._range.resample(range_used, self._range.folded(counts), range_steps)
+        rejected += self._texture.resample(texture_used, self._texture.folded(counts), texture)
+        sigma = self._range.sigma(range_used)
+        worst = max((slip for slip, _ in slips.values()), key=abs, default=None)
+        quality = ScanQuality(
+            coverage_of(range_steps),
+            passes=max(self._range.whole_laps(range_used), self._texture.whole_laps(texture_used)),
+            noise_mm=None if sigma is None else sigma * s.step_mm,
+            rejected=rejected,
+            slip_deg=worst,
+            has_slipped=bool(moved),
+            set_aside=len(moved),
+        )
+        return Grid(s, range_steps, texture), quality
+
+    def _slips_deg(self, range_laps: Laps, texture_laps: Laps) -> dict[int, tuple[float, bool]]:
+        """By how much each later lap is turned against the first, and whether that matters, as far as it shows."""
+        slips: dict[int, tuple[float, bool]] = {}
+        for lap in sorted(range_laps.keys() | texture_laps.keys())[1:]:
+            for columns, laps in ((self._texture, texture_laps), (self._range, range_laps)):
+                slip = columns.slip(laps, lap)
+                if slip is not None:
+                    slips[lap] = slip * 360.0 / columns.width, slip_matters(slip)
+                    break
+        return slips
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,13 +206,24 @@ class Resampling:
     weight: WeightArray
     missing: IntArray
 
+    def part(self, columns: slice) -> Resampling:
+        """The same for some of the columns; `missing` is left out."""
+        nothing = np.empty(0, np.int64)
+        return Resampling(self.left[columns], self.right[columns], self.weight[columns], nothing)
 
-def resampling(ticks: IntArray, slots: IntArray, counts_per_turn: int, width: int) -> Resampling:
+
+Laps = dict[int, Resampling]
+
+
+def resampling(
+    ticks: IntArray, slots: IntArray, counts_per_turn: int, width: int, lap: int | None = None
+) -> Resampling:
     """Plan W equal angles from columns at `ticks`, which stand in `slots`.
 
     ticks : (n,) distinct encoder counts from the left edge of column 0.  slots : (n,) where their columns are kept.
-    A column within half a count of an angle is that angle's. A gap of two columns or more, give or take a count, is a
-    hole, and the angles in it are missing.
+    lap : plan the angles of that turn from what was seen in its course; without it, `ticks` lie within one turn, which
+    closes on itself. A column within half a count of an angle is that angle's. A gap of two columns or more, give or
+    take a count, is a hole, and the angles in it are missing.
     """
     if not ticks.size:
         nothing = np.zeros(width, np.int64)
@@ -149,14 +231,15 @@ def resampling(ticks: IntArray, slots: IntArray, counts_per_turn: int, width: in
     order = np.argsort(ticks)
     ticks, slots = ticks[order], slots[order]
     turn = 2 * width * counts_per_turn  # angles in units of 1/(2 W counts) of a turn: both kinds are whole
-    angle = counts_per_turn * (2 * np.arange(width) + 1)
+    angle = counts_per_turn * (2 * np.arange(width) + 1) + (lap or 0) * turn
     before = np.searchsorted(2 * width * ticks, angle, side="right") - 1
     after = (before + 1) % ticks.size
-    gap = (2 * width * (ticks[after] - ticks[before]) - 1) % turn + 1  # one lone column: a whole turn
-    along = (angle - 2 * width * ticks[before]) % turn
+    period = turn if lap is None else 2 * width * (ticks[-1] - ticks[0]) + 2 * turn  # no end meets another there
+    gap = (2 * width * (ticks[after] - ticks[before]) - 1) % period + 1  # one lone column: a whole turn
+    along = (angle - 2 * width * ticks[before]) % period
     along = np.where(along <= width, 0, np.where(gap - along <= width, gap, along))
     hole = (0 < along) & (along < gap) & (gap >= 2 * (2 * counts_per_turn - width))
-    weight = ((along << WEIGHT_BITS) + gap // 2) // gap
+    weight = ((np.where(hole, 0, along) << WEIGHT_BITS) + gap // 2) // gap
     return Resampling(slots[before], slots[after], weight.astype(np.uint32), np.flatnonzero(hole))
 
 
@@ -178,11 +261,17 @@ class _Columns(Generic[Samples]):
     """The columns of one channel as they came: one slot per encoder count, each a copy made once."""
 
     def __init__(
-        self, channel: str, width: int, slots: Samples, blend: Callable[[Samples, Samples, WeightArray], Samples]
+        self,
+        channel: str,
+        width: int,
+        slots: Samples,
+        blend: Callable[[Samples, Samples, WeightArray], Samples],
+        tolerance: float,
     ) -> None:
         self._channel = channel
-        self._width = width
+        self.width = width
         self._slots: Samples = slots
+        self._tolerance = tolerance
         self._blend: Callable[[Samples, Samples, WeightArray], Samples] = blend
         self._slot_of: dict[int, int] = {}
         self._whole = (1 << slots.shape[1]) - 1
@@ -197,27 +286,126 @@ class _Columns(Generic[Samples]):
             raise RemoteWireError(f"{self._channel} rows {row0}+{samples.shape[0]} do not fit a column of {height}")
         slot = self._slot_of.get(tick, len(self._slot_of))
         if slot == len(self._slots):
-            raise RemoteWireError(f"more than {len(self._slots)} {self._channel} columns in one sweep")
+            self._grow()
         self._slot_of[tick] = slot
         self._slots[slot, row0 : row0 + samples.shape[0]] = samples
         self._rows[slot] |= ((1 << samples.shape[0]) - 1) << row0
 
-    def resampling(self, counts_per_turn: int) -> Resampling:
-        complete = [(tick, slot) for tick, slot in self._slot_of.items() if self._rows[slot] == self._whole]
-        ticks, slots = np.array(complete, np.int64).reshape(-1, 2).T
-        return resampling(ticks, slots, counts_per_turn, self._width)
+    def _grow(self) -> None:
+        """Make room for twice as many columns."""
+        if len(self._slots) >= TURNS_MAX * self.width:
+            raise RemoteWireError(f"more than {len(self._slots)} {self._channel} columns in one sweep")
+        larger = np.empty((2 * len(self._slots), *self._slots.shape[1:]), self._slots.dtype)
+        larger[: len(self._slots)] = self._slots
+        self._rows += [0] * len(self._slots)
+        self._slots = larger
 
-    def resample(self, plan: Resampling, grid: Samples) -> None:
-        """Fill a grid (H, W, ...) strip by strip: a strip of columns stays in the cache while it is turned."""
-        for start in range(0, self._width, STRIP_COLUMNS):
+    def _complete(self) -> tuple[IntArray, IntArray]:
+        """Ticks of the columns that are whole, and their slots. (n,) each"""
+        whole = [(tick, slot) for tick, slot in self._slot_of.items() if self._rows[slot] == self._whole]
+        ticks, slots = np.array(whole, np.int64).reshape(-1, 2).T
+        return ticks, slots
+
+    def folded(self, counts_per_turn: int) -> Resampling:
+        """All turns as one; of columns at the same angle, the first one stands for all."""
+        ticks, slots = self._complete()
+        order = np.argsort(ticks, kind="stable")
+        angles, first = np.unique(ticks[order] % counts_per_turn, return_index=True)
+        return resampling(angles, slots[order][first], counts_per_turn, self.width)
+
+    def laps(self, counts_per_turn: int) -> Laps:
+        """A plan for each turn that has something of its own."""
+        ticks, slots = self._complete()
+        numbers = np.unique(ticks // counts_per_turn).tolist()
+        plans = {lap: resampling(ticks, slots, counts_per_turn, self.width, lap) for lap in numbers}
+        return {lap: plan for lap, plan in plans.items() if plan.missing.size < self.width}
+
+    def whole_laps(self, laps: Laps) -> int:
+        """How many of them are turns, and not an overlap of two."""
+        return sum(2 * plan.missing.size < self.width for plan in laps.values())
+
+    def resample(self, laps: Laps, folded: Resampling, grid: Samples) -> int:
+        """Fill a grid (H, W, ...) strip by strip: a strip of columns stays in the cache while it is turned.
+
+        Angles that no lap has are taken from `folded`. Returns how many samples were left out of the mean.
+        """
+        seen = self._seen(laps)
+        sigma = self.sigma(laps) if len(laps) > 1 else None
+        tolerance = max(OUTLIER_SIGMAS * (sigma or 0.0), self._tolerance)
+        rejected = 0
+        for start in range(0, self.width, STRIP_COLUMNS):
             part = slice(start, start + STRIP_COLUMNS)
-            grid[:, part] = cv2.transpose(self._strip(plan.left[part], plan.right[part], plan.weight[part]))
+            plans = [plan for plan, has in zip(laps.values(), seen, strict=True) if has[part].any()]
+            if len(plans) < 2:
+                strip = self._strip(folded.part(part))
+            else:
+                has = np.stack([has[part] for has in seen if has[part].any()])
+                strip, left_out = self._mean([plan.part(part) for plan in plans], has, folded.part(part), tolerance)
+                rejected += left_out
+            grid[:, part] = cv2.transpose(strip)
+        return rejected
 
-    def _strip(self, left: IntArray, right: IntArray, weight: WeightArray) -> Samples:
-        if not np.any(weight % WEIGHT_ONE):
-            exact: Samples = self._slots[np.where(weight, right, left)]
+    def sigma(self, laps: Laps) -> float | None:
+        """Standard deviation of one sample, from the first two laps that have something in common."""
+        ordered = sorted(laps)
+        for one, other in zip(ordered, ordered[1:], strict=False):
+            both = np.flatnonzero(np.logical_and(*self._seen({one: laps[one], other: laps[other]})))[:SIGMA_COLUMNS]
+            if both.size:
+                a, b = (self._strip(_chosen(laps[lap], both)) for lap in (one, other))
+                return difference_sigma(a, b, self._measured(a) & self._measured(b))
+        return None
+
+    def slip(self, laps: Laps, lap: int) -> float | None:
+        """By how many columns a lap is turned against the first one, where it shows."""
+        first = min(laps, default=lap)
+        if lap == first or lap not in laps:
+            return None
+        one, other = self._seen({first: laps[first], lap: laps[lap]})
+        columns = np.flatnonzero(other)[:SLIP_COLUMNS]
+        before, after = (self._profile(_chosen(laps[number], columns)) for number in (first, lap))
+        return shift_between(before, after, one[columns], max(SLIP_REACH_MIN, self.width // 36))
+
+    def _profile(self, plan: Resampling) -> FloatArray:
+        """(n, m) columns thinned to at most 256 rows, NaN where void."""
+        strip = self._strip(plan)
+        thin = strip[:, :: max(1, strip.shape[1] // PROFILE_ROWS)]
+        values = np.where(self._measured(thin), thin, np.nan).astype(np.float64)
+        return values.reshape(len(values), -1)
+
+    def _seen(self, laps: Laps) -> list[BoolArray]:
+        """(W,) columns that each lap has."""
+        seen = [np.ones(self.width, np.bool_) for _ in laps]
+        for has, plan in zip(seen, laps.values(), strict=True):
+            has[plan.missing] = False
+        return seen
+
+    def _mean(
+        self, plans: list[Resampling], has: BoolArray, folded: Resampling, tolerance: float
+    ) -> tuple[Samples, int]:
+        """(n, H, ...) the mean of what several laps have, and how many samples were left out."""
+        strips: Samples = np.stack([self._strip(plan) for plan in plans])
+        shape = (*has.shape, *(1,) * (strips.ndim - 2))
+        mean, left_out = average(strips, self._measured(strips) & has.reshape(shape), tolerance)
+        none = ~has.any(axis=0)
+        if none.any():
+            mean[none] = self._strip(folded)[none]
+        return mean, int(left_out.sum())
+
+    def _measured(self, samples: Samples) -> BoolArray:
+        """Which samples are not void, same shape; every texel is measured."""
+        return samples != VOID if self._slots.ndim == 2 else np.ones(samples.shape, np.bool_)
+
+    def _strip(self, plan: Resampling) -> Samples:
+        """(n, H, ...) the columns of a plan."""
+        if not np.any(plan.weight % WEIGHT_ONE):
+            exact: Samples = self._slots[np.where(plan.weight, plan.right, plan.left)]
             return exact
-        return self._blend(self._slots[left], self._slots[right], weight)
+        return self._blend(self._slots[plan.left], self._slots[plan.right], plan.weight)
+
+
+def _chosen(plan: Resampling, columns: IntArray) -> Resampling:
+    """A plan of some columns."""
+    return Resampling(plan.left[columns], plan.right[columns], plan.weight[columns], np.empty(0, np.int64))
 
 
 def _mix(left: Samples, right: Samples, weight: WeightArray) -> WeightArray:

@@ -20,10 +20,11 @@ from protocol.framing import SERIAL_PAYLOAD_MAX
 from protocol.grid import FloatArray, GridSpec, ImageArray, IntArray, StepArray
 
 MAJOR = 1
-MINOR = 0
+MINOR = 1
 TEXT_MAX = 200  # bytes of UTF-8 in any text field
 PASSES_MAX = 64
 RUNS_MAX = 160
+OVERLAP_TURN = 256  # an overlap is told in this part of a turn
 
 Payload = bytes | memoryview
 
@@ -229,27 +230,39 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class SweepRequest:
-    """Host to device, CONFIG: what the next sweep shall measure; a size of 0 leaves that size to the scanner."""
+    """Host to device, CONFIG: what the next sweep shall measure; a size of 0 leaves that size to the scanner.
+
+    overlap : how far beyond the passes to go on, in 1/256 turn.   stride : take every so many-th column of the first
+    pass in a fast turn ahead of the others, so that the whole object shows early; 1 does not. Both since 1.1.
+    """
 
     TYPE: ClassVar[int] = 0x10
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBHHHH")
+    _SINCE_1_1: ClassVar[struct.Struct] = struct.Struct("<BB")
     channels: Channel = Channel.BOTH
     passes: int = 1
     width: int = 0
     height: int = 0
     texture_width: int = 0
     texture_height: int = 0
+    overlap: int = 0
+    stride: int = 1
 
     def to_bytes(self) -> bytes:
         """As the table CONFIG."""
         sizes = (self.width, self.height, self.texture_width, self.texture_height)
-        return self._LAYOUT.pack(self.channels, self.passes, *sizes)
+        appended = self._SINCE_1_1.pack(self.overlap, self.stride)
+        return self._LAYOUT.pack(self.channels, self.passes, *sizes) + appended
 
     @classmethod
     def from_bytes(cls, payload: Payload) -> Self:
         """Inverse of to_bytes."""
-        channels, passes, *sizes = _unpack(cls._LAYOUT, payload)
-        return cls(_channels(channels), _passes(passes), *sizes)
+        channels, passes, width, height, texture_width, texture_height = _unpack(cls._LAYOUT, payload)
+        overlap, stride = _unpack_appended(cls._SINCE_1_1, payload, cls._LAYOUT.size, (0, 1))
+        _check(stride > 0, "stride is 0")
+        return cls(
+            _channels(channels), _passes(passes), width, height, texture_width, texture_height, overlap, stride
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,11 +307,13 @@ class SweepHeader:
 
     spec : shapes and geometry.  encoder_start : count at the angle spec.theta0_rad.  direction : +1 when counts grow
     counter-clockwise seen from above, -1 otherwise.  range_rows, texture_rows : samples in every piece of a column but
-    its last.  calibration : as in Calibration.
+    its last.  calibration : as in Calibration.  overlap : columns of that part of a turn (in 1/256) follow the last
+    pass, under the pass number `passes` (since 1.1).
     """
 
     TYPE: ClassVar[int] = 0x22
     _LAYOUT: ClassVar[struct.Struct] = struct.Struct("<ddddQIiHHHHHHHBBb")
+    _SINCE_1_1: ClassVar[struct.Struct] = struct.Struct("<B")
     sweep: int
     spec: GridSpec
     counts_per_turn: int
@@ -309,6 +324,7 @@ class SweepHeader:
     encoder_start: int = 0
     direction: int = 1
     calibration: int = 0
+    overlap: int = 0
 
     def to_bytes(self) -> bytes:
         """As the table SWEEP_HEADER."""
@@ -318,7 +334,7 @@ class SweepHeader:
             self.calibration, self.counts_per_turn, self.encoder_start,
             self.sweep, s.width, s.height, s.texture_width, s.texture_height, self.range_rows, self.texture_rows,
             self.channels, self.passes, self.direction,
-        )  # fmt: skip
+        ) + self._SINCE_1_1.pack(self.overlap)  # fmt: skip
 
     @classmethod
     def from_bytes(cls, payload: Payload) -> Self:
@@ -328,10 +344,11 @@ class SweepHeader:
         shape, (range_rows, texture_rows, channels, passes, direction) = fields[8:12], fields[12:]
         _check(counts > 0 and range_rows > 0 and texture_rows > 0, "counts_per_turn and rows must be positive")
         _check(direction in (1, -1), "direction must be 1 or -1")
+        (overlap,) = _unpack_appended(cls._SINCE_1_1, payload, cls._LAYOUT.size, (0,))
         spec = GridSpec(*shape, *geometry)
         return cls(
             sweep, spec, counts, range_rows, texture_rows, _channels(channels), _passes(passes), start, direction,
-            calibration,
+            calibration, overlap,
         )  # fmt: skip
 
     def angle_rad(self, encoder: IntArray | int) -> FloatArray:
@@ -344,6 +361,14 @@ class SweepHeader:
         if channel is Channel.RANGE:
             return self.spec.width, self.spec.height, self.range_rows
         return self.spec.texture_width, self.spec.texture_height, self.texture_rows
+
+    def columns_in(self, channel: Channel) -> tuple[int, ...]:
+        """How many columns of one channel each pass has; the overlap, if there is one, comes as a last, short pass."""
+        if channel not in self.channels:
+            return ()
+        width = self.shape(channel)[0]
+        beyond = width * self.overlap // OVERLAP_TURN
+        return (width,) * self.passes + ((beyond,) if beyond else ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -537,6 +562,13 @@ def _check(good: bool, complaint: str) -> None:
 def _unpack(layout: struct.Struct, payload: Payload) -> tuple[Any, ...]:
     _check(len(payload) >= layout.size, f"{len(payload)} bytes, needs {layout.size}")
     return layout.unpack_from(payload)
+
+
+def _unpack_appended(
+    layout: struct.Struct, payload: Payload, at: int, absent: tuple[int, ...]
+) -> tuple[Any, ...]:
+    """Fields that a newer minor version appended, or what their absence means."""
+    return layout.unpack_from(payload, at) if len(payload) >= at + layout.size else absent
 
 
 def _channels(value: int) -> Channel:

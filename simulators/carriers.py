@@ -11,14 +11,42 @@ import tty
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Protocol
 
 from protocol.errors import PortLost
-from simulators.scanner import SimulatedScanner
+from simulators.faults import Unplugged
 
 _READ_BYTES = 65536
 _PORTION_BYTES = 4096
 _BITS_PER_BYTE = 10  # start, eight data, stop
 _CATCH_UP_S = 0.02  # a sleep that came back late may be made good up to this
+
+
+
+class Device(Protocol):
+    """The end of a line that a carrier serves: a SimulatedScanner, or one with faults on the way.
+
+    portion_bytes : most bytes that arrive at once, if that is bounded.
+    """
+
+    portion_bytes: int | None
+
+    def receive_data(self, data: bytes, now_s: float) -> None:
+        """Take bytes from the node."""
+        ...
+
+    def step(self, now_s: float) -> None:
+        """Let the time become now_s."""
+        ...
+
+    def data_to_send(self, max_bytes: int) -> bytes:
+        """About `max_bytes` for the node. Raises Unplugged."""
+        ...
+
+    def wait_s(self, now_s: float) -> float:
+        """How long it can do without being stepped. [s]"""
+        ...
+
 
 Line = Callable[[bytes], bytes]
 
@@ -39,7 +67,7 @@ class MemoryPort:
 
     def __init__(
         self,
-        scanner: SimulatedScanner,
+        scanner: Device,
         *,
         rate_bytes_s: float = math.inf,
         step_s: float = 0.005,
@@ -61,12 +89,14 @@ class MemoryPort:
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read; time passes in steps until bytes arrive or `timeout_s` is over."""
-        self._check_plugged()
         until_s = self._now_s + timeout_s
+        if not self._arrived:
+            self._check_plugged()
         while not self._arrived and self._now_s < until_s and not self._is_cancelled.is_set():
             self._pass_time(min(self._step_s, until_s - self._now_s))
         self._is_cancelled.clear()
-        data, self._arrived = self._arrived[:max_bytes], self._arrived[max_bytes:]
+        size = min(max_bytes, self._scanner.portion_bytes or max_bytes)
+        data, self._arrived = self._arrived[:size], self._arrived[size:]
         return data
 
     def write(self, data: bytes) -> None:
@@ -86,12 +116,24 @@ class MemoryPort:
         """Pull the plug: every later use raises PortLost."""
         self._is_unplugged = True
 
+    def replugged(self, after_s: float = 0.0) -> MemoryPort:
+        """A new port to the same scanner, so much later."""
+        port = MemoryPort(self._scanner, step_s=self._step_s, to_node=self._to_node, to_scanner=self._to_scanner)
+        port._portion_bytes, port._now_s = self._portion_bytes, self._now_s + after_s
+        return port
+
     def _pass_time(self, dt_s: float) -> None:
         before_s, self._now_s = self._now_s, self._now_s + dt_s
         if self._now_s == before_s:  # a step too short for the clock to show
             self._now_s = math.nextafter(before_s, math.inf)
+        if self._is_unplugged:
+            return
         self._scanner.step(self._now_s)
-        self._arrived += self._to_node(self._scanner.data_to_send(self._portion_bytes))
+        try:
+            data = self._scanner.data_to_send(self._portion_bytes)
+        except Unplugged as pulled:
+            data, self._is_unplugged = pulled.data, True
+        self._arrived += self._to_node(data)
 
     def _check_plugged(self) -> None:
         if self._is_unplugged:
@@ -110,12 +152,26 @@ class PtyPort:
         self._rate_bytes_s = baud / _BITS_PER_BYTE
         self._free_s = 0.0
         _check_free(link_path)
+        self._wake_read, self._wake_write = os.pipe()
+        self._master = self._slave = -1
+        self.plug_in()
+
+    def plug_in(self) -> None:
+        """Make a line and the link that leads to it."""
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        self._wake_read, self._wake_write = os.pipe()
         self._target = os.ttyname(self._slave)
-        _replace_link(link_path, self._target)
+        _replace_link(self._link_path, self._target)
+
+    def hang_up(self) -> None:
+        """What pulling the plug looks like: the line is gone, and so is the link."""
+        with suppress(OSError):
+            if os.readlink(self._link_path) == self._target:
+                os.unlink(self._link_path)
+        for descriptor in (self._master, self._slave):
+            os.close(descriptor)
+        self._master = self._slave = -1
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read."""
@@ -141,11 +197,10 @@ class PtyPort:
         os.write(self._wake_write, b"x")
 
     def close(self) -> None:
-        """Hang up, which is what pulling the plug looks like, and take the link away."""
-        with suppress(OSError):
-            if os.readlink(self._link_path) == self._target:
-                os.unlink(self._link_path)
-        for descriptor in (self._master, self._slave, self._wake_read, self._wake_write):
+        """Hang up for good."""
+        if self._master >= 0:
+            self.hang_up()
+        for descriptor in (self._wake_read, self._wake_write):
             os.close(descriptor)
 
     def _pace(self, size_bytes: int) -> None:
@@ -156,7 +211,7 @@ class PtyPort:
             time.sleep(self._free_s - now_s)
 
 
-def serve(scanner: SimulatedScanner, port: PtyPort, stop: threading.Event) -> None:
+def serve(scanner: Device, port: PtyPort, stop: threading.Event) -> None:
     """Run a scanner on a port until `stop` is set (and the port's `cancel` called, to be heard at once)."""
     while not stop.is_set():
         now_s = time.monotonic()
@@ -165,9 +220,18 @@ def serve(scanner: SimulatedScanner, port: PtyPort, stop: threading.Event) -> No
         if data:
             scanner.receive_data(data, now_s)
         scanner.step(now_s)
-        data = scanner.data_to_send(_PORTION_BYTES)
-        if data:
-            port.write(data)
+        try:
+            _write(port, scanner.data_to_send(_PORTION_BYTES), scanner.portion_bytes or _PORTION_BYTES)
+        except Unplugged as pulled:
+            port.write(pulled.data)
+            port.hang_up()
+            stop.wait(pulled.away_s)
+            port.plug_in()
+
+
+def _write(port: PtyPort, data: bytes, portion_bytes: int) -> None:
+    for at in range(0, len(data), portion_bytes):
+        port.write(data[at : at + portion_bytes])
 
 
 def _check_free(path: Path) -> None:

@@ -1,14 +1,11 @@
 """A software scanner: a turntable that speaks the device's end of the scanner link. No I/O and no clock of its own.
 
-It sends columns live, in the order the table turns, and holds the newest `retention_columns` of them to send again.
-When the node gives no credit, a few columns wait in the outbox and then the table stops: nothing is dropped.
+It sends columns live, in the order the table turns, or buffered, from its memory and coarse to fine, and holds the
+newest `retention_columns` of them to send again. When the node gives no credit, a few columns wait in the outbox and
+then the table stops: nothing is dropped.
 """
 
 from __future__ import annotations
-
-import zlib
-from collections import deque
-from collections.abc import Iterator
 
 from protocol.framing import SERIAL_PAYLOAD_MAX
 from protocol.scanner_link import Accepted, Command, Role, ScannerLink, Unanswered
@@ -17,38 +14,30 @@ from protocol.scanner_messages import (
     RUNS_MAX,
     Calibrate,
     Calibration,
-    Channel,
     Column,
-    ColumnRun,
     ColumnsGone,
     DeviceInfo,
     Hello,
     NakCode,
-    Outcome,
+    Order,
     RangeColumn,
     RequestColumns,
     Reset,
     State,
     Status,
-    SweepEnd,
     SweepHeader,
     SweepRequest,
     SweepStart,
     SweepStop,
     TextureColumn,
 )
-from simulators.turntable import Exposure, Turntable
+from simulators.sweep import Sweep
+from simulators.turntable import Turntable
 
-_OUTBOX_COLUMNS = 16
 _STATUS_S = 0.5
 _STATUS_STARVED_S = 0.1
 _STEP_S = 0.005  # while the table moves and nothing can be sent
 _IDLE_S = 0.5
-_COLUMN_OF: dict[Channel, type[RangeColumn] | type[TextureColumn]] = {
-    Channel.RANGE: RangeColumn,
-    Channel.TEXTURE: TextureColumn,
-}
-Key = tuple[Channel, int, int]
 
 
 class SimulatedScanner:
@@ -56,6 +45,8 @@ class SimulatedScanner:
 
     boot_id : another one stands for a device that was switched off and on.
     """
+
+    portion_bytes: int | None = None
 
     def __init__(
         self,
@@ -66,9 +57,10 @@ class SimulatedScanner:
         calibration: int = 1,
         retention_columns: int = 65535,
         payload_max: int = SERIAL_PAYLOAD_MAX,
+        order: Order = Order.LIVE,
     ) -> None:
         counts = table.counts_per_turn
-        self.info = DeviceInfo(serial_number, boot_id, counts, retention_columns, "simulator", payload_max=payload_max)
+        self.info = DeviceInfo(serial_number, boot_id, counts, retention_columns, "simulator", order, payload_max)
         self.state = State.IDLE
         self._table = table
         self._calibration = calibration
@@ -76,7 +68,7 @@ class SimulatedScanner:
         self._now_s: float | None = None
         self._status_s = 0.0
         self._request: SweepRequest | None = None
-        self._sweep: _Sweep | None = None
+        self._sweep: Sweep | None = None
 
     def receive_data(self, data: bytes, now_s: float) -> None:
         """Take bytes off the line and do what they say."""
@@ -182,7 +174,7 @@ class SimulatedScanner:
         if request is None:
             return NakCode.NOT_NOW, "no configuration yet"
         try:
-            self._table.begin(request.channels, request.passes)
+            self._table.begin(request.channels, request.passes, request.overlap, request.stride)
         except ValueError as error:
             return NakCode.UNSUPPORTED, str(error)
         room = self._link.peer_payload_max - COLUMN_OVERHEAD
@@ -196,8 +188,9 @@ class SimulatedScanner:
             passes=request.passes,
             encoder_start=self._table.home_encoder,
             calibration=self._calibration,
+            overlap=request.overlap,
         )
-        self._sweep = _Sweep(header, self._table, self.info.retention_columns)
+        self._sweep = Sweep(header, self._table, self.info.retention_columns, self.info.order)
         self.state = State.SWEEPING
         return None
 
@@ -264,85 +257,3 @@ class SimulatedScanner:
             self.state = State.HOLDING
             sweep.owes_end = False
             self._link.send(sweep.end())
-
-
-class _Sweep:
-    """One sweep: its columns exposed, waiting, sent and held."""
-
-    def __init__(self, header: SweepHeader, table: Turntable, retention_columns: int) -> None:
-        self.header = header
-        self.is_announced = False
-        self.owes_end = True
-        self._table = table
-        self._retention_columns = retention_columns
-        self._outcome = Outcome.COMPLETE
-        self._waiting: deque[Exposure] = deque()
-        self._again: deque[Exposure] = deque()
-        self._pieces: deque[Column] = deque()
-        self._is_first_time = True
-        self._held: dict[Key, Exposure] = {}
-        self._exposed: set[Key] = set()
-        self._count = 0
-        self._digest = 0
-
-    @property
-    def head(self) -> Column | None:
-        """The piece to be sent next, columns asked for again going first."""
-        if not self._pieces and (self._again or self._waiting):
-            self._is_first_time = not self._again
-            exposure = (self._again or self._waiting).popleft()
-            self._pieces.extend(self._cut(exposure))
-        return self._pieces[0] if self._pieces else None
-
-    def take(self) -> Column:
-        """Hand the head over."""
-        piece = self._pieces.popleft()
-        if self._is_first_time:
-            self._count += 1
-            self._digest = (self._digest + zlib.crc32(piece.to_bytes())) % 2**32
-        return piece
-
-    def expose(self, dt_s: float) -> None:
-        """Let the table turn as far as there is room."""
-        for exposure in self._table.step(dt_s, max(0, _OUTBOX_COLUMNS - len(self._waiting))):
-            self._waiting.append(exposure)
-            key = (exposure.channel, exposure.pass_index, exposure.column)
-            self._exposed.add(key)
-            self._held[key] = exposure
-            if len(self._held) > self._retention_columns:
-                del self._held[next(iter(self._held))]
-
-    def cut_short(self) -> None:
-        """Send nothing more but the end."""
-        self._outcome = Outcome.STOPPED
-        self.is_announced = self.owes_end = True
-        self._waiting.clear()
-        self._again.clear()
-        self._pieces.clear()
-
-    def send_again(self, runs: tuple[ColumnRun, ...]) -> list[ColumnRun]:
-        """Queue what is still held of these columns; returns those exposed once and held no longer."""
-        self.owes_end = True
-        gone: list[ColumnRun] = []
-        for run in runs:
-            for column in range(run.first, run.first + run.count):
-                key = (run.channel, run.pass_index, column)
-                if key in self._held:
-                    self._again.append(self._held[key])
-                elif key in self._exposed:
-                    gone.append(ColumnRun(run.channel, run.pass_index, column, 1))
-        return gone
-
-    def end(self) -> SweepEnd:
-        """What SWEEP_END says now."""
-        return SweepEnd(self.header.sweep, self._outcome, self._count, self._digest)
-
-    def _cut(self, exposure: Exposure) -> Iterator[Column]:
-        """The pieces of one column."""
-        samples = self._table.samples(exposure)
-        rows = self.header.shape(exposure.channel)[2]
-        for row0 in range(0, len(samples), rows):
-            data = samples[row0 : row0 + rows].tobytes()
-            yield _COLUMN_OF[exposure.channel](
-                self.header.sweep, exposure.pass_index, exposure.column, row0, exposure.encoder, exposure.time_us, data
-            )

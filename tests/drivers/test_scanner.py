@@ -390,7 +390,7 @@ def test_a_scanner_of_another_version_is_a_fault_that_names_both() -> None:
         return data and encode_frame(0x02, b"", seq=0, session=int.from_bytes(data[6:8], "little"), version=9)
 
     bench = Bench(to_node=of_version_9)
-    with pytest.raises(ScannerFault, match="speaks link version 9, this node 1.0"):
+    with pytest.raises(ScannerFault, match="speaks link version 9, this node 1.1"):
         bench.scanner.hello()
 
 

@@ -291,7 +291,7 @@ def test_another_major_version_is_reported_and_told() -> None:
     joined.host.data_to_send()
     (refused,) = joined.to_host()
     assert isinstance(refused, Refused)
-    assert refused.code is NakCode.VERSION and "1.0" in refused.text
+    assert refused.code is NakCode.VERSION and "1.1" in refused.text
     joined.host.receive_data(encode_frame(2, b"", seq=0, session=7, version=9), 0.0)
     assert drain(joined.host) == [WrongVersion(9)]
 

@@ -1,0 +1,100 @@
+"""Single bad range samples: spikes taken out, small holes filled and marked; larger holes stay void.
+
+A spike lies further from all eight neighbours than any surface this grid resolves could. A hole of up to three cells
+is filled with the mean of the measured cells round it, weighted by nearness. Columns are cyclic, rows are not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from protocol.grid import VOID, BoolArray, Grid, IntArray, StepArray
+
+HOLE_CELLS_MAX = 3
+SPIKE_ROWS = 3.0  # a spike stands out by more than this many rows' height
+SPIKE_SIGMAS = 8.0
+_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+_UNREACHED = int(np.iinfo(np.uint16).max)
+_NEIGHBOURS_MIN = 5  # fewer, and it is the edge of something
+_OFFSETS = np.argwhere(_RING).T - 1
+_NEAR = [(r, c) for r in range(-2, 3) for c in range(-2, 3) if (r, c) != (0, 0)]
+_WEIGHT = np.array([1 / (r * r + c * c) for r, c in _NEAR])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repaired:
+    """A grid without spikes and small holes. filled : (H, W) cells whose value is made up.  spikes : how many."""
+
+    grid: Grid
+    filled: BoolArray
+    spikes: int
+
+
+def repair(grid: Grid, noise_mm: float = 0.0) -> Repaired:
+    """Take spikes out and fill small holes; a grid without any is returned as it is, bit for bit."""
+    tall_mm = max(SPIKE_ROWS * grid.spec.pitch_mm, SPIKE_SIGMAS * noise_mm)
+    spikes = spikes_in(grid.range_steps, tall_mm / grid.spec.step_mm)
+    steps = np.where(spikes, np.uint16(VOID), grid.range_steps) if spikes.any() else grid.range_steps
+    holes = small_holes(steps == VOID)
+    filled, values = fill(steps, np.argwhere(holes))
+    if filled.size:
+        steps = steps.copy()
+        steps[tuple(filled.T)] = values
+    mask = np.zeros(steps.shape, np.bool_)
+    mask[tuple(filled.T)] = True
+    return Repaired(Grid(grid.spec, steps, grid.texture), mask, int(spikes.sum()))
+
+
+def spikes_in(steps: StepArray, tall_steps: float) -> BoolArray:
+    """(H, W) measured cells higher or lower than all measured neighbours by more than `tall_steps`; at least five."""
+    padded = cv2.copyMakeBorder(steps, 0, 0, 1, 1, cv2.BORDER_WRAP)
+    highest = cv2.dilate(padded, _RING, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    above = cv2.subtract(padded, highest)  # stops at 0
+    padded[padded == VOID] = _UNREACHED
+    lowest = cv2.erode(padded, _RING, borderType=cv2.BORDER_CONSTANT, borderValue=_UNREACHED)
+    below = cv2.subtract(lowest, padded)
+    far = np.maximum(above, below)[:, 1:-1] > tall_steps
+    far[steps == VOID] = False
+    cells = np.argwhere(far)
+    enough = _measured_round(steps, cells) >= _NEIGHBOURS_MIN
+    far[tuple(cells[~enough].T)] = False
+    return far
+
+
+def _measured_round(steps: StepArray, cells: IntArray) -> IntArray:
+    """(n,) how many of the eight neighbours of each cell (n, 2) are measured."""
+    rows, columns = (cells[:, axis, None] + _OFFSETS[axis] for axis in (0, 1))
+    height, width = steps.shape
+    inside = (0 <= rows) & (rows < height)
+    measured = inside & (steps[np.clip(rows, 0, height - 1), columns % width] != VOID)
+    return np.asarray(measured.sum(axis=1), np.int64)
+
+
+def small_holes(void: BoolArray) -> BoolArray:
+    """(H, W) void cells that hang together, at corners too, with at most two others."""
+    pad = HOLE_CELLS_MAX + 1
+    wide = cv2.copyMakeBorder(void.astype(np.uint8), 0, 0, pad, pad, cv2.BORDER_WRAP)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=8, ltype=cv2.CV_32S)
+    is_small = stats[:, cv2.CC_STAT_AREA] <= HOLE_CELLS_MAX
+    is_small[0] = False
+    small: BoolArray = is_small[labels[:, pad:-pad]]
+    return small
+
+
+def fill(steps: StepArray, holes: IntArray) -> tuple[IntArray, StepArray]:
+    """Values for void cells from what is measured within two cells. holes : (n, 2) rows and columns.
+
+    Returns those that have measured neighbours, (m, 2), and their values, (m,) uint16.
+    """
+    height, width = steps.shape
+    rows = holes[:, :1] + np.array([r for r, _ in _NEAR])
+    columns = (holes[:, 1:] + np.array([c for _, c in _NEAR])) % width
+    around = steps[np.clip(rows, 0, height - 1), columns].astype(np.float64)
+    weight = _WEIGHT * ((around != VOID) & (0 <= rows) & (rows < height))
+    total = weight.sum(axis=1)
+    known = total > 0
+    values = np.rint((around * weight).sum(axis=1)[known] / total[known]).astype(np.uint16)
+    return holes[known], values
