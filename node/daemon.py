@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import time
+from functools import partial
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from importlib.metadata import version
@@ -21,8 +22,9 @@ from node.capture import Capture
 from node.config import Config
 from node.exhibits import Exhibits
 from node.identity import node_identity
-from node.library import About, Library
+from node.library import About, Library, Scan
 from node.live import Live
+from node.resume import publish_complete
 from node.notify import Notifier, keep_notified, status_text
 from node.serve import NodeServer
 from protocol import messages as m
@@ -53,8 +55,13 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
     """Bring up every part and leave its end to the stack. Returns the URL that clients use, and the scanner's owner."""
     folder = config.library.path
     library = await asyncio.to_thread(Library, folder, config.first_view.max_bytes)
+    stack.callback(library.close)
+    for found in library.found:
+        log.warning("library: after the last end: %s", found)
     for problem in library.problems:
         log.warning("library: %s left alone: %s", problem.name, problem.reason)
+    for said in await asyncio.to_thread(publish_complete, library.sweeps, partial(_keep, library)):
+        log.warning("library: %s", said)
     exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers)
     stack.callback(exhibits.close)
     loop = asyncio.get_running_loop()
@@ -73,6 +80,10 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}", capture
 
 
+def _keep(library: Library, grid: Grid) -> Scan:
+    return library.add(grid, About(time.time()))
+
+
 def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | None, list[Callable[[str], object]]]:
     """The capture thread's owner, and the list of who is told of each new scan."""
     announce: list[Callable[[str], object]] = []
@@ -84,13 +95,14 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
         return SerialPort(path, config.capture.baud)
 
     def deliver(grid: Grid) -> None:
-        scan = library.add(grid, About(time.time()))
+        scan = _keep(library, grid)
         log.info("scan published: %d x %d", grid.spec.width, grid.spec.height)
         live.published(scan.id)
         for tell in announce:
             tell(scan.id)
 
-    return Capture(open_port, ScannerConfig(quiet_s=config.capture.stale_s), deliver, live.watch), announce
+    link = ScannerConfig(quiet_s=config.capture.stale_s)
+    return Capture(open_port, link, deliver, live.watch, library.sweeps), announce
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:
