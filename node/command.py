@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from node.library_command import add_library_command
+
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `serve` and `doctor`."""
+    add_library_command(subparsers)
     serve = subparsers.add_parser("serve", help="run the node: read the scanner, keep scans, serve clients")
     serve.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML); options here win over them")
     serve.add_argument("--library", metavar="DIR", help="folder the scans are kept in")

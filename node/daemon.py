@@ -8,9 +8,9 @@ import os
 import signal
 import socket
 import time
-from functools import partial
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,8 +24,8 @@ from node.exhibits import Exhibits
 from node.identity import node_identity
 from node.library import About, Library, Scan
 from node.live import Live
-from node.resume import publish_complete
 from node.notify import Notifier, keep_notified, status_text
+from node.resume import publish_complete
 from node.serve import NodeServer
 from protocol import messages as m
 from protocol.grid import Grid

@@ -55,6 +55,12 @@ class Exhibits:
         model = self._models.get(scan.id)
         return model.result() if model is not None and model.done() and model.exception() is None else None
 
+    def forget(self, scan_id: str) -> None:
+        """Drop what was made of a scan that is gone."""
+        for key in [key for key in self._views if key[0] == scan_id]:
+            del self._views[key]
+        self._models.pop(scan_id, None)
+
     def resolve(self, scan_id: str) -> str:
         """The id that "latest" stands for; any other is returned as it is. Raises LibraryError when there is none."""
         if scan_id != "latest":

@@ -15,9 +15,11 @@ from node.auth import Auth, require
 from node.capture import Capture
 from node.config import Config
 from node.connection import Connection
+from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
 from node.library import ScanSummary
+from node.library_routes import LibraryRoutes
 from node.live import Live
 from node.page import Page
 from node.shared import SharedFoveae
@@ -57,6 +59,7 @@ class NodeServer:
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._app = web.Application(middlewares=[self._auth.admit, _explain], client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.append(_harden)
+        self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
         self._app.add_routes([
             *Page().routes(),
             web.get("/healthz", self._health),
@@ -67,6 +70,7 @@ class NodeServer:
             web.post("/v1/sweeps", self._sweep),
             web.get("/v1/stream", self._stream),
             *self._shared.routes(),
+            *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
         ])  # fmt: skip
         self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=REQUESTS_S)
 
@@ -91,6 +95,11 @@ class NodeServer:
         """Tell every client of a new scan."""
         for connection in self._connections:
             connection.publish(scan_id)
+
+    def _forget(self, scan_id: str) -> None:
+        """A scan was deleted: nothing made of it is kept here any longer."""
+        self._exhibits.forget(scan_id)
+        self._shared.void()
 
     def show_live(self) -> None:
         """Send every client that watches what is new in the running sweep."""
