@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -23,6 +24,7 @@ from protocol.codec import RangeCodec, decode_range
 from protocol.framing import Frame, FrameReader
 from protocol.holdings import ChannelHoldings, range_rank
 from protocol.lattice import Channel, build_lattice
+from protocol.live import LiveColumns
 from protocol.reconstruct import select
 from protocol.refinement import HEADER, unpack_parameters
 from protocol.scanner_messages import Ack, Hello, decode_message
@@ -30,11 +32,8 @@ from protocol.session import Phase, Role, Session
 from tests.system.line import RunningNode, run_line
 
 ROOT = Path(__file__).parents[1]
-README, ARCHITECTURE, PROTOCOL = (
-    (ROOT / name).read_text() for name in ("README.md", "ARCHITECTURE.md", "PROTOCOL.md")
-)
+README, ARCHITECTURE, PROTOCOL = ((ROOT / name).read_text() for name in ("README.md", "ARCHITECTURE.md", "PROTOCOL.md"))
 PACKAGES = ("protocol", "drivers", "exchange", "node", "client", "simulators")
-FILE = r"(?:[\w.-]+/)*[\w.-]+\.(?:py|md|toml|txt|ts|json)"
 
 
 def code_blocks(text: str, language: str = "") -> list[str]:
@@ -128,12 +127,22 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
 
 
 def test_the_sample_of_the_readme_runs(running: RunningNode, tmp_path: Path) -> None:
-    [sample] = code_blocks(README, "python")
+    sample, _ = code_blocks(README, "python")
     assert "nodes[0]" in sample  # another node may be on this network while tests run
     script = sample.replace("nodes[0]", repr(running.url))
     ran = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert ran.returncode == 0, ran.stderr
     assert re.match(r"complete \d+ bytes; \(100, 360\) \(256, 1024, 3\)", ran.stdout), ran.stdout
+
+
+def test_the_live_sample_of_the_readme_runs(running: RunningNode, tmp_path: Path) -> None:
+    sample, live = code_blocks(README, "python")
+    script = sample.replace("nodes[0]", repr(running.url))
+    inside = "        await session.start_sweep()\n" + textwrap.indent(live, " " * 8)
+    script = script.replace("\nasyncio.run", f"{inside}\nasyncio.run")
+    ran = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert ran.returncode == 0, ran.stderr
+    assert re.search(r"^100 %.*\npublished [0-9a-f]{32}$", ran.stdout, re.MULTILINE), ran.stdout
 
 
 def transcripts() -> list[list[tuple[str, m.Message]]]:
@@ -149,11 +158,9 @@ def transcripts() -> list[list[tuple[str, m.Message]]]:
 def test_transcripts_of_the_protocol_are_said_in_an_order_that_a_stream_allows() -> None:
     look, live = transcripts()
     node, client = Session(Role.NODE), Session(Role.CLIENT)
-    greeting = look[:3]
     for said in (*look[:-1], *live, look[-1]):
         speaker, listener = (node, client) if said[0] == "node" else (client, node)
         listener.receive(speaker.send(said[1]))
-    assert len(greeting) == 3
     assert node.phase is client.phase is Phase.CLOSED
 
 
@@ -182,6 +189,13 @@ def test_frames_dumped_in_the_protocol_are_sound() -> None:
         assert isinstance(frame, Frame)
         messages.append(decode_message(frame.type, frame.payload))
     assert [type(message) for message in messages] == [Hello, Ack]
+
+
+def test_live_columns_dumped_in_the_protocol_are_what_the_page_says() -> None:
+    [dump] = [block for block in code_blocks(PROTOCOL) if block.startswith("46 4c")]
+    columns = LiveColumns.from_bytes(bytes.fromhex(dump))
+    assert (columns.channel, columns.sweep) == (Channel.RANGE, 0x04030201)
+    assert columns.samples.tolist() == [[0x0B0A], [0x0D0C]]
 
 
 def test_the_lift_example_of_the_protocol_decodes() -> None:
