@@ -173,8 +173,8 @@ class Session:
         look = _checked_look(
             m.Look(
                 request,
-                float(u),
-                float(v),
+                u,
+                v,
                 window,
                 texture_db,
                 range_mm,
@@ -388,6 +388,7 @@ def _settle(answer: asyncio.Future[Answer], value: Answer | Exception) -> None:
 
 def _checked_look(look: m.Look) -> m.Look:
     try:
-        return msgspec.convert(msgspec.to_builtins(look), m.Look)
-    except (msgspec.ValidationError, TypeError) as error:
+        plain = msgspec.to_builtins(look, enc_hook=float)  # numbers of numpy are numbers too
+        return msgspec.convert(plain, m.Look)
+    except (msgspec.ValidationError, TypeError, ValueError) as error:
         raise LocalWireError(f"look: {error}") from None

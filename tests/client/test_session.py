@@ -156,6 +156,8 @@ async def test_every_parameter_of_a_look_reaches_the_node() -> None:
             max_wait_s=0.5,
             max_bytes=9000,
             fill=True,
+            alpha=0.5,
+            scale=0.3,
             parameters={
                 "range": {"p": 2, "quantum": 3, "s": None},
                 "texture": {"p": 1.5, "quality": 40, "codec": "jpeg", "s": 2.0},
@@ -163,7 +165,7 @@ async def test_every_parameter_of_a_look_reaches_the_node() -> None:
         )
         with pytest.raises(NodeLost):
             await look
-    assert await heard == m.Look(2, 0.25, 0.75, 0.1, 35.0, 0.2, 0.5, 9000, True, "default", wanted)
+    assert await heard == m.Look(2, 0.25, 0.75, 0.1, 35.0, 0.2, 0.5, 9000, True, 0.5, 0.3, "default", wanted)
 
 
 # Acknowledgements and agreement
