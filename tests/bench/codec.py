@@ -16,8 +16,17 @@ import numpy as np
 
 from node.coarse import fill_voids
 from protocol.codec import (
-    JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, RangeCodec, TextureCodec, decode_range, decode_texture, encode_mask,
-    encode_range, encode_texture, jpeg_q,
+    JPEG_QUALITY_MAX,
+    JPEG_QUALITY_MIN,
+    LOSSY_MAX,
+    RangeCodec,
+    TextureCodec,
+    decode_range,
+    decode_texture,
+    encode_mask,
+    encode_range,
+    encode_texture,
+    jpeg_q,
 )  # fmt: skip
 from protocol.grid import VOID, ImageArray, StepArray
 from tests.bench.rivals.draco_range import encode_mesh, faces, positions
@@ -51,7 +60,10 @@ def run(scans: list[BenchScan], size: str, repeats: int) -> dict[str, Any]:
 def texture_codecs(image: ImageArray, target_db: float, repeats: int) -> dict[str, dict[str, float]]:
     """Each codec at the lowest quality that has target_db: bytes, dB, times of cv2.imencode and cv2.imdecode."""
     found: dict[str, tuple[TextureCodec, int, bool]] = {}
-    for codec, bounds in ((TextureCodec.JPEG, (JPEG_QUALITY_MIN, JPEG_QUALITY_MAX)), (TextureCodec.HTJ2K, (0, LOSSY_MAX))):
+    for codec, bounds in (
+        (TextureCodec.JPEG, (JPEG_QUALITY_MIN, JPEG_QUALITY_MAX)),
+        (TextureCodec.HTJ2K, (0, LOSSY_MAX)),
+    ):
         quality = least(lambda q, codec=codec: psnr_db(_there_and_back(image, codec, q), image) >= target_db, *bounds)
         if quality is not None:
             found[codec.name] = codec, quality, False
@@ -68,7 +80,9 @@ def texture_codecs(image: ImageArray, target_db: float, repeats: int) -> dict[st
     }
     payloads = {name: encode_texture(image, codec, q, quick=quick) for name, (codec, q, quick) in found.items()}
     for name, (codec, quality, quick) in found.items():
-        jobs[f"encode {name}"] = lambda codec=codec, q=quality, quick=quick: encode_texture(image, codec, q, quick=quick)
+        jobs[f"encode {name}"] = lambda codec=codec, q=quality, quick=quick: encode_texture(
+            image, codec, q, quick=quick
+        )
         jobs[f"decode {name}"] = lambda name=name, codec=codec, q=quality: decode_texture(
             payloads[name], codec, q, image.shape[:2]
         )
@@ -173,8 +187,14 @@ def told(record: dict[str, Any]) -> str:
             for name, f in row["range"].items()
         ]
         mask = row["mask"]
-        lines.append(f"| {row['scan']} mask, {mask['share']:.0%} void | {mask['bytes']} | | {mask['ns_a_vertex']:.1f} | |")
-    lines += ["", "| Z only | Draco XYZ bits | Draco lattice bits | HTJ2K Z bits | XYZ / Z | lattice / Z |", "|---" * 6 + "|"]
+        lines.append(
+            f"| {row['scan']} mask, {mask['share']:.0%} void | {mask['bytes']} | | {mask['ns_a_vertex']:.1f} | |"
+        )
+    lines += [
+        "",
+        "| Z only | Draco XYZ bits | Draco lattice bits | HTJ2K Z bits | XYZ / Z | lattice / Z |",
+        "|---" * 6 + "|",
+    ]
     for row in record["rows"]:
         lines += [
             f"| {row['scan']} {step} | {f['draco_xyz_bits']:.2f} | {f['draco_lattice_bits']:.2f} | {f['z_only_bits']:.2f} |"

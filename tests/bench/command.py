@@ -52,7 +52,7 @@ def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:
 def _line(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     from tests.bench import line
 
-    record = line.run(scans[0], args.size, args.clicks, args.repeats)
+    record = line.run(scans[0], args.clicks, args.repeats)
     return record, line.told(record)
 
 

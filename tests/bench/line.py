@@ -7,7 +7,7 @@ Each figure is a ratio to something that the same machine did in the same run: c
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,15 @@ from protocol.framing import USB_PAYLOAD_MAX, Frame, FrameReader, encode_frame
 from protocol.grid import Grid, ImageArray
 from protocol.holdings import ChannelHoldings, texture_rank
 from protocol.lattice import Channel, build_lattice
-from protocol.messages import CodecName, Look, LookParameters, Opened, RangeParameters, TextureParameters, encode_message
+from protocol.messages import (
+    CodecName,
+    Look,
+    LookParameters,
+    Opened,
+    RangeParameters,
+    TextureParameters,
+    encode_message,
+)
 from protocol.reconstruct import select
 from protocol.refinement import Refinement
 from protocol.region import region_round
@@ -38,7 +46,7 @@ from tests.bench.timing import MEGABYTE, medians_s
 
 PAYLOAD_BYTES = 4096
 READ_BYTES = 65536
-STREAM_FRAMES = 8192
+STREAM_FRAMES = 4096
 WINDOW = 0.05
 QUALITY = 42  # reaches 40 dB on a skin-like texture
 FIRST_VIEW_BYTES = 32768
@@ -66,8 +74,8 @@ class Case:
 CASES = tuple(Case(codec, p) for codec in CODECS for p in (1, 2))
 
 
-def run(scan: BenchScan, size: str, clicks: int, repeats: int) -> dict[str, Any]:
-    """Everything, on one scan; first views at every size that it has."""
+def run(scan: BenchScan, clicks: int, repeats: int, sizes: Iterable[str] = tuple(SIZES)) -> dict[str, Any]:
+    """Everything, on one scan; its first view at every size that it has."""
     with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
         published = scan.published(Path(folder))
         return {
@@ -76,7 +84,7 @@ def run(scan: BenchScan, size: str, clicks: int, repeats: int) -> dict[str, Any]
             "after_last_column": after_last_column(scan.grid, repeats),
             "updates": [update(published, case, scan.clicks(1)[0], repeats) for case in CASES],
             "searched": searched(published, scan, clicks),
-            "first_view_bytes": first_views(scan),
+            "first_view_bytes": first_views(scan, sizes),
         }  # fmt: skip
 
 
@@ -174,10 +182,10 @@ def searched(published: Scan, scan: BenchScan, clicks: int) -> dict[str, Any]:
     return {f"encodes_{codec}": counts for codec, counts in encodes.items()}
 
 
-def first_views(scan: BenchScan) -> dict[str, dict[str, int] | str]:
+def first_views(scan: BenchScan, among: Iterable[str]) -> dict[str, dict[str, int] | str]:
     """First view at every size: bytes of its three messages, by codec."""
     sizes: dict[str, dict[str, int] | str] = {}
-    for size in SIZES if scan.name in (*GENERATORS, *REAL) else (scan.size,):
+    for size in among if scan.name in (*GENERATORS, *REAL) else (scan.size,):
         try:
             sized = scan if size == scan.size else load(scan.name, size)
         except Skipped as reason:

@@ -69,4 +69,10 @@ def wire_bytes(update: Update) -> int:
 
 
 def _told(sent: Any) -> dict[str, Any]:
-    return {"channel": sent.channel, "p": sent.p, "quality": sent.quality, "codec": sent.codec, "bytes": sent.payload_bytes}
+    return {
+        "channel": sent.channel,
+        "p": sent.p,
+        "quality": sent.quality,
+        "codec": sent.codec,
+        "bytes": sent.payload_bytes,
+    }

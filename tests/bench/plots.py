@@ -34,7 +34,13 @@ def _draw(scan: BenchScan, size: str, folder: Path, cache: Cache) -> Path:
     curves = {"foveascan": asyncio.run(_ours(scan)), **{rival: _rival(rival, scan, cache) for rival in RIVALS}}
     figure, axes = pyplot.subplots(figsize=(7, 5), layout="constrained")
     for name, curve in curves.items():
-        axes.plot([b for b, _ in curve], [db for _, db in curve], marker="o", linewidth=3 if name == "foveascan" else 1.5, label=name)
+        axes.plot(
+            [b for b, _ in curve],
+            [db for _, db in curve],
+            marker="o",
+            linewidth=3 if name == "foveascan" else 1.5,
+            label=name,
+        )
     axes.set(
         xscale="log", xlabel="bytes for one click beyond the first view", ylabel="texture PSNR asked for [dB]",
         title=f"{scan.name} {size}, 5% of the area, range within 0.1 mm",

@@ -54,8 +54,10 @@ async def _looks(scans: list[BenchScan], clicks: int) -> list[dict[str, Any]]:
 
 def told(record: dict[str, Any]) -> str:
     """The summary, then each limit."""
-    fill = "no limit bound" if record["fill_mean"] is None else (
-        f"fill {record['fill_mean']:.1%} in the mean, {record['fill_least']:.1%} at least"
+    fill = (
+        "no limit bound"
+        if record["fill_mean"] is None
+        else (f"fill {record['fill_mean']:.1%} in the mean, {record['fill_least']:.1%} at least")
     )
     lines = [
         f"{record['size']}: encodes an update {record['encodes_mean']:.2f} in the mean"

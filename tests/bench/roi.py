@@ -94,10 +94,16 @@ def told(record: dict[str, Any]) -> str:
         asked = "<= 1.10" if rival.startswith("ours") else f">= {ASKED[rival]}" if rival in ASKED else ""
         figures = " | ".join(f"{by_scan[name]:.2f}" for name in [*scans, "mean"])
         lines.append(f"| {rival} | {figures} | {asked} |")
-    lines += ["", "| ours | bytes | range mm | texture dB | node ms | encodes | 1, 10, 100 Mbit/s: ms to detail |", "|---" * 7 + "|"]
+    lines += [
+        "",
+        "| ours | bytes | range mm | texture dB | node ms | encodes | 1, 10, 100 Mbit/s: ms to detail |",
+        "|---" * 7 + "|",
+    ]
     for row in record["rows"]:
         ours = row["ours"]
-        times = ", ".join(f"{ours['node_ms'] + 1000 * ours['size_bytes'] / rate:.0f}" for rate in LINKS_BYTES_S.values())
+        times = ", ".join(
+            f"{ours['node_ms'] + 1000 * ours['size_bytes'] / rate:.0f}" for rate in LINKS_BYTES_S.values()
+        )
         lines.append(
             f"| {row['scan']} {row['click'][0]:.3f},{row['click'][1]:.3f} | {ours['size_bytes']} |"
             f" {ours['range_error_mm']:.3f} | {ours['texture_db']:.2f}{'' if ours['reached'] else ' MISSED'} |"

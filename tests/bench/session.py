@@ -14,7 +14,12 @@ from tests.bench.cache import Cache
 from tests.bench.ours import Looked, look, node_with
 from tests.bench.rivals import jpip
 from tests.bench.rivals.caching import (
-    Windows, jpip_session, range_session, texture_sessions, windows_of, with_replies,
+    Windows,
+    jpip_session,
+    range_session,
+    texture_sessions,
+    windows_of,
+    with_replies,
 )  # fmt: skip
 from tests.bench.rivals.offer import Unreachable, straight
 from tests.bench.roi import geometric_mean
@@ -82,7 +87,11 @@ def told(record: dict[str, Any]) -> str:
         figures = " | ".join(str(sum(row["rivals"][name])) if name in row["rivals"] else "-" for name in names)
         lines.append(f"| {row['scan']} | {row['our_bytes']}{f', {missed} MISSED' if missed else ''} | {figures} |")
     figures = " | ".join(f"{record['ratios'][name]:.2f}" for name in names)
-    lines += [f"| rival / ours | | {figures} |", "", f"best rival / ours {record['ratios']['best rival']:.2f}, asked >= {ASKED}"]
+    lines += [
+        f"| rival / ours | | {figures} |",
+        "",
+        f"best rival / ours {record['ratios']['best rival']:.2f}, asked >= {ASKED}",
+    ]
     lines += [f"skipped: {name}: {why}" for name, why in record["missing"].items()]
     return "\n".join(lines)
 

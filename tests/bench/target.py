@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from protocol.region import Region, region_round
 
 PERCENTILE = 99
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Window:
         return self.texture_db(texels) >= self.target.texture_db
 
 
-def crop(dense: StepArray | ImageArray, region: Region) -> StepArray | ImageArray:
+def crop(dense: NDArray[Scalar], region: Region) -> NDArray[Scalar]:
     """A region of a grid, the seam joined."""
     return dense[region.rows].take(region.columns, axis=1)
 

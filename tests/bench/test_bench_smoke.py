@@ -26,7 +26,7 @@ def test_roi_compares_what_is_verified_with_what_is_verified(scan: BenchScan):
 
 
 def test_line_measures_every_part(scan: BenchScan):
-    record = line.run(scan, "S", 1, 1)
+    record = line.run(scan, 1, 1, ["S"])
     assert record["deframing"]["mb_s"] > 0
     assert {case["case"].split(",")[0] for case in record["updates"]} == {"jpeg", "htj2k"}
     assert line.told(record)
@@ -53,6 +53,6 @@ def test_a_scan_is_turned_so_that_a_click_stays_off_the_seam(scan: BenchScan):
 
 
 def test_the_command_prints_one_object(capsys: pytest.CaptureFixture[str]):
-    arguments = ["bench", "line", "--json", "--size", "S", "--specimen", "sphere", "--clicks", "1", "--repeats", "1"]
+    arguments = ["bench", "codec", "--json", "--size", "S", "--specimen", "sphere", "--repeats", "1"]
     assert foveascan.main(arguments) == 0
     assert json.loads(capsys.readouterr().out)["conditions"]["cores"]

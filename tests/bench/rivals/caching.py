@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol import codec_htj2k
 from protocol.region import Region
@@ -32,6 +33,7 @@ JPIP_CUTS = (jpip.CUTS[0], jpip.CUTS[2])
 Images = list[np.ndarray]
 Coder = Callable[[Images, int], tuple[Images, int]]  # tiles, setting (rising quality) -> decoded tiles, bytes
 Windows = list[Window]
+Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # of the full image, of the level's
 
 
 @dataclass(frozen=True)
@@ -164,17 +166,21 @@ def windows_of(scan: BenchScan, clicks: list[Click], target: Target) -> Windows:
 
 
 def _jpip_channel(stream: CodeStream, windows: Windows, channel: str, free: jpip.Free) -> list[int] | None:
-    held = jpip.first_view(stream, stream.layers if free.size_bytes == jpip.Free().size_bytes else _target_layers(stream), free)
+    held = jpip.first_view(
+        stream, stream.layers if free.size_bytes == jpip.Free().size_bytes else _target_layers(stream), free
+    )
     sizes = []
     for window in windows:
         region: Region = window.texture if channel == "texture" else window.range
         bins = jpip.precincts_over(stream, region, 0)
 
-        def good(layers: int, bins: list[list[int]] = bins, region: Region = region, window: Window = window) -> bool:
-            made = crop(stream.decode(held | jpip.packets_of(stream, bins, layers)), region)
+        def good(
+            layers: int, had: NDArray[np.bool_] = held, bins: list[list[int]] = bins, window: Window = window
+        ) -> bool:
+            made = stream.decode(had | jpip.packets_of(stream, bins, layers))
             if channel == "texture":
-                return window.texture_reached(np.asarray(made))
-            return window.range_reached(np.maximum(made, 1).astype(np.uint16))
+                return window.texture_reached(crop(made, window.texture))
+            return window.range_reached(np.maximum(crop(made, window.range), 1).astype(np.uint16))
 
         layers = least(good, 1, stream.layers)
         if layers is None:
@@ -225,7 +231,7 @@ def _range_coder(codec: str, quanta: list[int], tiles: Images, setting: int) -> 
     return [(value * np.float32(quantum)).astype(np.float32) for value in values], size
 
 
-def _texture_rect(shapes: tuple[tuple[int, ...], ...], tile: int, window: Window) -> Any:
+def _texture_rect(shapes: Shapes, tile: int, window: Window) -> Any:
     return tiles_over(window.texture, *shapes, tile)
 
 
@@ -233,8 +239,8 @@ def _range_rect(full: tuple[int, ...], level: tuple[int, ...], tile: int, window
     return tiles_over(window.range, full, level, tile)
 
 
-def _show_texture(shapes: tuple[tuple[int, ...], ...], kernel: str, received: np.ndarray, rect: Any, window: Window) -> np.ndarray:
-    return np.asarray(enlarged(received, rect, window.texture, shapes, kernel))
+def _show_texture(shapes: Shapes, kernel: str, received: np.ndarray, rect: Any, window: Window) -> np.ndarray:
+    return enlarged(received, rect, window.texture, shapes, kernel)
 
 
 def _show_range(level: float, received: np.ndarray, rect: Any, window: Window) -> np.ndarray:

@@ -85,7 +85,9 @@ class CodeStream:
 
     def decode(self, wanted: NDArray[np.bool_]) -> np.ndarray:
         """The image from the packets that are wanted."""
-        body = b"".join(packet if keep else EMPTY for packet, keep in zip(self.packets, wanted.ravel().tolist(), strict=True))
+        body = b"".join(
+            packet if keep else EMPTY for packet, keep in zip(self.packets, wanted.ravel().tolist(), strict=True)
+        )
         tile = struct.pack(">HHHIBBH", _SOT, 10, 0, len(body) + 14, 0, 1, _SOD)
         return np.asarray(imagecodecs.jpeg2k_decode(self.head + tile + body + _EOC))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 
 from tests.bench.cache import Cache
 from tests.bench.rivals import draco_range, htj2k_texture, jpeg_texture, jpeg_whole, jpip, range_tiles
@@ -17,14 +18,14 @@ PARTS: Mapping[str, Part] = {
     "draco_full": draco_range.full_offer,
     "draco_tiles": lambda scan, window, _: draco_range.tiles_offer(scan, window),
     "range_tiles": lambda scan, window, _: range_tiles.range_offer(scan, window),
-    "jpip_range": lambda *all: jpip.range_offer(*all, jpip.AS_COARSE_AS_OURS["range"]),
-    "jpip_range_large": lambda *all: jpip.range_offer(*all, jpip.AS_LARGE_AS_OURS["range"]),
+    "jpip_range": partial(jpip.range_offer, free=jpip.AS_COARSE_AS_OURS["range"]),
+    "jpip_range_large": partial(jpip.range_offer, free=jpip.AS_LARGE_AS_OURS["range"]),
     "jpeg_full": jpeg_whole.texture_offer,
     "progressive_jpeg": jpeg_whole.progressive_offer,
     "jpeg_tiles": lambda scan, window, _: jpeg_texture.texture_offer(scan, window),
     "htj2k_tiles": lambda scan, window, _: htj2k_texture.texture_offer(scan, window),
-    "jpip_texture": lambda *all: jpip.texture_offer(*all, jpip.AS_COARSE_AS_OURS["texture"]),
-    "jpip_texture_large": lambda *all: jpip.texture_offer(*all, jpip.AS_LARGE_AS_OURS["texture"]),
+    "jpip_texture": partial(jpip.texture_offer, free=jpip.AS_COARSE_AS_OURS["texture"]),
+    "jpip_texture_large": partial(jpip.texture_offer, free=jpip.AS_LARGE_AS_OURS["texture"]),
 }
 SOURCES = {
     "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles", "jpip_range": "jpip",

@@ -35,9 +35,7 @@ def texture_offer(scan: BenchScan, window: Window) -> Offer:
     return cheapest(offers)
 
 
-def _offer(
-    scan: BenchScan, window: Window, level: Level, tile: int, low: int, high: int
-) -> tuple[int, Offer] | None:
+def _offer(scan: BenchScan, window: Window, level: Level, tile: int, low: int, high: int) -> tuple[int, Offer] | None:
     """The lowest quality in low..high that reaches the target, and what it takes."""
     image = texture_level(scan, level.spacing, level.shrink)
     shapes = scan.grid.texture.shape, image.shape
@@ -47,10 +45,12 @@ def _offer(
 
     def reached(quality: int) -> bool:
         received, sizes[quality] = _coded(source, tile, quality)
-        return window.texture_reached(np.asarray(enlarged(received, rect, window.texture, shapes, level.enlarge)))
+        return window.texture_reached(enlarged(received, rect, window.texture, shapes, level.enlarge))
 
     quality = least(reached, low, high)
-    return None if quality is None else (quality, Offer(sizes[quality], f"HTJ2K {quality}, tiles of {tile}, {level.name}"))
+    return (
+        None if quality is None else (quality, Offer(sizes[quality], f"HTJ2K {quality}, tiles of {tile}, {level.name}"))
+    )
 
 
 def _coded(image: np.ndarray, tile: int, quality: int) -> tuple[ImageArray, int]:

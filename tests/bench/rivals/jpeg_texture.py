@@ -7,6 +7,8 @@ The tables cost the rival nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -44,23 +46,20 @@ def _offer(scan: BenchScan, window: Window, level: Level, chroma: str, near: int
     return Offer(size, f"JPEG {chroma} Q {q}, tiles of {tile}, {level.name}")
 
 
-def _least_q(
-    scan: BenchScan, window: Window, level: Level, chroma: str, low: int, high: int, tile: int
-) -> int | None:
+def _least_q(scan: BenchScan, window: Window, level: Level, chroma: str, low: int, high: int, tile: int) -> int | None:
     image, rect = _tiles(scan, window, level, tile)
     source = rect.of(image)
     shapes = scan.grid.texture.shape, image.shape
 
     def reached(q: int) -> bool:
         received = decode_tiles(encode_tiles(source, tile, chroma, q), source.shape, tile)
-        return window.texture_reached(np.asarray(enlarged(received, rect, window.texture, shapes, level.enlarge)))
+        return window.texture_reached(enlarged(received, rect, window.texture, shapes, level.enlarge))
 
     return least(reached, low, high)
 
 
-def least(reached: object, low: int, high: int) -> int | None:
+def least(reached: Callable[[int], bool], low: int, high: int) -> int | None:
     """The lowest setting that reaches the target, taking quality to rise with it; None when the highest does not."""
-    assert callable(reached)
     if not reached(high):
         return None
     while low < high:
@@ -82,7 +81,9 @@ def encode_tiles(image: np.ndarray, tile: int, chroma: str, q: int) -> list[byte
     height, width = (-(-side // tile) for side in image.shape[:2])
     padding = ((0, height * tile - image.shape[0]), (0, width * tile - image.shape[1]), (0, 0))
     padded = np.pad(image, padding, "edge") if padding != ((0, 0),) * 3 else image
-    return encode_stack(padded.reshape(height, tile, width, tile, 3).swapaxes(1, 2).reshape(-1, tile, tile, 3), chroma, q)
+    return encode_stack(
+        padded.reshape(height, tile, width, tile, 3).swapaxes(1, 2).reshape(-1, tile, tile, 3), chroma, q
+    )
 
 
 def decode_tiles(files: list[bytes], shape: tuple[int, ...], tile: int) -> ImageArray:

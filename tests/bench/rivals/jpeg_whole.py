@@ -1,4 +1,4 @@
-"""Texture as one JPEG of everything: at the Q that the window needs, or progressive and stopped once the window is good.
+"""Texture as one JPEG of everything: at the Q the window needs, or progressive and stopped once the window is good.
 
 The file is the smallest of baseline and progressive, with and without chroma at half the resolution.
 """

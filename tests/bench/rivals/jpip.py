@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.grid import ImageArray
 from protocol.region import Region
 from tests.bench.cache import Cache
 from tests.bench.rivals.codestream import EMPTY, CodeStream, Layout, make
@@ -87,7 +86,7 @@ def offers_of(stream: CodeStream, region: Region, reached: Reached, free: Free) 
 
         def enough(layers: int, bins: list[list[int]] = bins) -> bool:
             wanted = packets_of(stream, bins, layers) | first_view(stream, layers, free)
-            return reached(np.asarray(crop(stream.decode(wanted), region)))
+            return reached(crop(stream.decode(wanted), region))
 
         layers = least(enough, 1, stream.layers)
         if layers is not None:
@@ -144,7 +143,9 @@ def message_bytes(stream: CodeStream, wanted: NDArray[np.bool_], held: NDArray[n
     lengths = (stream.sizes * (new & speaks)).sum(axis=0)
     offsets = (stream.sizes * held).sum(axis=0)
     sent = np.flatnonzero(lengths)
-    headers = sum(_header_bytes(*each) for each in zip(sent.tolist(), offsets[sent].tolist(), lengths[sent].tolist(), strict=True))
+    headers = sum(
+        _header_bytes(*each) for each in zip(sent.tolist(), offsets[sent].tolist(), lengths[sent].tolist(), strict=True)
+    )
     return int(lengths.sum()) + headers
 
 

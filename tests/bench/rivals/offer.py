@@ -1,7 +1,7 @@
 """What every rival answers: how many bytes it needs for a click, verified by decoding what it would have sent.
 
-Rivals pay what we pay: REPLY_BYTES for the reply, a void mask where the window has voids, and PIECE_BYTES for each tile's
-length. Headers that are constant for a session cost nothing, nor do fitted Huffman tables, nor the first view.
+Rivals pay REPLY_BYTES for the reply, a void mask where the window has voids, and PIECE_BYTES for each tile's length.
+Headers that are constant for a session cost them nothing, nor do fitted Huffman tables, nor the first view.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ TILES = (16, 32, 64, 128, 256)
 SHRINK = {"box": Image.Resampling.BOX, "cubic": Image.Resampling.BICUBIC, "lanczos": Image.Resampling.LANCZOS}
 ENLARGE = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 
-Samples = NDArray[np.uint8] | NDArray[np.float32]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Rect:
     right: int
     bottom: int
 
-    def of(self, image: Samples) -> Samples:
+    def of(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Its samples."""
         return image[self.top : self.bottom, self.left : self.right]
 
@@ -79,7 +80,9 @@ def tiles_over(region: Region, full: tuple[int, ...], level: tuple[int, ...], ti
     )
 
 
-def enlarged(received: Samples, rect: Rect, region: Region, shapes: tuple[tuple[int, ...], ...], kernel: str) -> Samples:
+def enlarged(
+    received: ImageArray, rect: Rect, region: Region, shapes: tuple[tuple[int, ...], tuple[int, ...]], kernel: str
+) -> ImageArray:
     """What a client shows in a region from the tiles it has; shapes : of the full image and of the level's.
 
     Beyond the tiles their outermost samples go on.
@@ -92,7 +95,7 @@ def enlarged(received: Samples, rect: Rect, region: Region, shapes: tuple[tuple[
     y = (np.arange(region.top, region.top + region.height) + 0.5) * level[0] / full[0] - 0.5 - rect.top
     at_x, at_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
     made = cv2.remap(received, at_x, at_y, ENLARGE[kernel], borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(made)
+    return np.asarray(made, np.uint8)
 
 
 def promising(scan: BenchScan, window: Window, target_db: float) -> list[Level]:
@@ -102,7 +105,7 @@ def promising(scan: BenchScan, window: Window, target_db: float) -> list[Level]:
         image = texture_level(scan, level.spacing, level.shrink)
         rect = tiles_over(window.texture, scan.grid.texture.shape, image.shape, 32)
         shapes = scan.grid.texture.shape, image.shape
-        db = window.texture_db(np.asarray(enlarged(rect.of(image), rect, window.texture, shapes, level.enlarge), np.uint8))
+        db = window.texture_db(enlarged(rect.of(image), rect, window.texture, shapes, level.enlarge))
         if db > max(target_db, best.get(level.spacing, (0.0, level))[0]):
             best[level.spacing] = db, level
     return [level for _, level in best.values()]

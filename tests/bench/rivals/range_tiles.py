@@ -20,14 +20,16 @@ from protocol.grid import StepArray
 from tests.bench.rivals.offer import PIECE_BYTES, Offer, cheapest, void_mask
 from tests.bench.rivals.pyramid import ENLARGE, LEVELS, TILES, Rect, tiles_over
 from tests.bench.scans import BenchScan
-from tests.bench.target import Window, crop
+from tests.bench.target import Window
 
 KERNELS = ("linear", "cubic")
 
 
 def range_offer(scan: BenchScan, window: Window) -> Offer:
     """The cheapest tiles that show the window within the target's error, with its void mask."""
-    offers = [offer for level in LEVELS for sampling in ("point", "mean") for offer in _offers(scan, window, level, sampling)]
+    offers = [
+        offer for level in LEVELS for sampling in ("point", "mean") for offer in _offers(scan, window, level, sampling)
+    ]
     return cheapest(offers) + void_mask(window)
 
 
@@ -62,7 +64,9 @@ def filled_range(scan: BenchScan) -> NDArray[np.float32]:
     return np.asarray(fill_voids(scan.grid.range_steps), np.float32)
 
 
-def shown(received: NDArray[np.float32], rect: Rect, window: Window, level: float, sampling: str, kernel: str) -> StepArray:
+def shown(
+    received: NDArray[np.float32], rect: Rect, window: Window, level: float, sampling: str, kernel: str
+) -> StepArray:
     """The window's range from the samples that were received. uint16 [steps]"""
     region, full = window.range, window.grid.range_steps.shape
     x, y = np.arange(region.left, region.left + region.width), np.arange(region.top, region.top + region.height)
