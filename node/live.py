@@ -80,7 +80,7 @@ class Live:
 
     def _start(self, header: SweepHeader) -> None:
         self._sweeps += 1
-        self._picture = _Picture(self._sweeps, header, self._first_view_bytes, self._clock())
+        self._picture = _Picture(self._sweeps, header, self._first_view_bytes)
         self._tell_now()
 
     def _take(self, column: Column) -> None:
@@ -135,8 +135,9 @@ class Place:
 class _Picture:
     """One sweep, thinned. `_progress` and `ended` are replaced whole, so setting them needs no lock."""
 
-    def __init__(self, sweep: int, header: SweepHeader, first_view_bytes: int, now_s: float) -> None:
-        s, self.sweep, self._began_s = header.spec, sweep, now_s
+    def __init__(self, sweep: int, header: SweepHeader, first_view_bytes: int) -> None:
+        s, self.sweep = header.spec, sweep
+        self._began: tuple[float, float] | None = None
         cells_max, texels_max = first_view_bytes // BYTES_PER_RANGE_CELL, first_view_bytes // BYTES_PER_TEXEL
         cells = coarse_shape(s.height, s.width, RANGE_SPACING_MIN, cells_max)
         texels = coarse_shape(s.texture_height, s.texture_width, TEXTURE_SPACING_MIN, texels_max)
@@ -159,10 +160,11 @@ class _Picture:
         self._track_of(column).take(cell, column)
 
     def progress(self, share: float, now_s: float) -> None:
-        """So much of the sweep is in."""
-        left_s = max(0.0, (now_s - self._began_s) * (1 - share) / share) if share > 0 else None
-        percent = round(100 * min(max(share, 0.0), 1.0), 1)
-        self._progress = m.LiveProgress(self.sweep, percent, None if left_s is None else round(left_s, 1))
+        """So much of the sweep is in. How fast the rest comes is judged since the first word: some may have been kept."""
+        self._began = self._began or (share, now_s)
+        share_0, began_s = self._began
+        left_s = round((1 - share) * (now_s - began_s) / (share - share_0), 1) if share > share_0 else None
+        self._progress = m.LiveProgress(self.sweep, round(100 * share, 1), left_s)
 
     def next(self, place: Place) -> list[LiveSaid]:
         """As Live.next: what is new in each channel, then how far the sweep is; once there is nothing, the end."""
@@ -198,7 +200,7 @@ class _Track:
 
     def cell_of(self, column: Column) -> int | None:
         counts = self._encoder.counts_per_turn
-        along = self._encoder.tick(column.encoder) * self._cells  # in cells, of `counts` parts each
+        along = self._encoder.tick(column.encoder) % counts * self._cells  # in cells, of `counts` parts each
         cell = along // counts
         off_centre = abs(2 * (along - cell * counts) - counts)
         if off_centre * self._width > 2 * counts * self._cells:  # more than one column of the scanner

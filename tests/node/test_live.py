@@ -159,6 +159,15 @@ def test_progress_in_percent_and_seconds_left() -> None:
     assert progress_of(live, 1.0) == m.LiveProgress(1, 100.0, 0.0)
 
 
+def test_what_was_kept_of_a_sweep_does_not_make_it_faster() -> None:
+    now = [100.0]
+    live = Live(lambda: None, clock=lambda: now[0])
+    live.watch(SweepStarted(header()))
+    progress_of(live, 0.5)
+    now[0] += 3
+    assert progress_of(live, 0.75) == m.LiveProgress(1, 75.0, 3.0)
+
+
 def publish(live: Live) -> None:
     live.published("ab")
 
