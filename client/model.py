@@ -19,7 +19,7 @@ from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, 
 from protocol.errors import CodecError, LatticeError, RemoteWireError
 from protocol.grid import VOID, BoolArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
 from protocol.holdings import ChannelHoldings, Holdings, range_rank, texture_rank
-from protocol.lattice import Channel, build_lattice
+from protocol.lattice import Channel, Parameters, build_lattice
 from protocol.messages import ScanInfo, Statement
 from protocol.reconstruct import (
     Selection,
@@ -103,6 +103,10 @@ class Model:
         """
         write_grid(self.grid, path)
 
+    def digest(self) -> str:
+        """What proves to the node that both ends agree on what we hold."""
+        return self.holdings.digest()
+
     def state(self) -> Statement:
         """Its holdings as they travel. From here on the digest counts anew, as it does at the node (F-09c)."""
         self.holdings.content = 0
@@ -117,33 +121,38 @@ class Model:
         started_s = time.perf_counter()
         try:
             coarse = refinement.generator is Generator.COARSE
+            if not (coarse or self.complete):
+                raise RemoteWireError(f"{name_of(refinement)}: a fovea before the first view")
             blocks = self._apply_first_view(refinement) if coarse else self._apply_fovea(refinement)
         except (CodecError, LatticeError) as error:
-            raise RemoteWireError(f"{_name(refinement)}: {error}") from error
+            raise RemoteWireError(f"{name_of(refinement)}: {error}") from error
         return Applied(blocks, time.perf_counter() - started_s)
 
     def _apply_first_view(self, refinement: Refinement) -> IntArray:
         channel = refinement.channel
         if channel in self._viewed:
-            raise RemoteWireError(f"{_name(refinement)}: a second first view")
+            raise RemoteWireError(f"{name_of(refinement)}: a second first view")
         shape = self.shapes[channel]
         coarse_shape = shape.coarse_height, shape.coarse_width
         if refinement.samples != shape.coarse_height * shape.coarse_width:
-            raise RemoteWireError(f"{_name(refinement)}: {refinement.samples} samples for {coarse_shape}")
+            raise RemoteWireError(f"{name_of(refinement)}: {refinement.samples} samples for {coarse_shape}")
+        self._fill(refinement, coarse_shape)
+        self._viewed.add(channel)
+        return np.arange(shape.blocks[0] * shape.blocks[1])
+
+    def _fill(self, refinement: Refinement, coarse_shape: tuple[int, int]) -> None:
+        """The whole of a channel from its first view."""
+        shape = self.shapes[refinement.channel]
         _rank(refinement)
-        if channel is Channel.RANGE:
+        if refinement.channel is Channel.RANGE:
             coarse = _decode_range(refinement, coarse_shape)
             _apply_mask(refinement, coarse)
             self._steps = coarse_to_range(coarse, shape)
             self._range_mm = None
         else:
-            self._texels = coarse_to_texture(_decode_texture(refinement, coarse_shape), shape)
-        self._viewed.add(channel)
-        return np.arange(shape.blocks[0] * shape.blocks[1])
+            self._texels = coarse_to_texture(texture_of(refinement, coarse_shape), shape)
 
     def _apply_fovea(self, refinement: Refinement) -> IntArray:
-        if not self.complete:
-            raise RemoteWireError(f"{_name(refinement)}: a fovea before the first view")
         selection, adopted = self._select(refinement)
         blocks = selection.adopted_blocks()
         if refinement.channel is Channel.RANGE:
@@ -153,21 +162,22 @@ class Model:
             self.holdings.add_content(blocks, content_hashes(steps, selection))
             self._range_mm = self._spacing = None
         else:
-            texels = _decode_texture(refinement, selection.sample_shape)
+            texels = texture_of(refinement, selection.sample_shape)
             paste(self._texels, texture_patch(selection, texels), selection)
         self.holdings.channels[refinement.channel].adopt(selection.lattice, adopted, _rank(refinement))
         return blocks
 
     def _select(self, refinement: Refinement) -> tuple[Selection, BoolArray]:
         """Which samples arrived and which blocks they may change, from the parameters and holdings the node had too."""
-        assert refinement.parameters is not None  # Refinement.from_bytes sees to it
+        if not isinstance(refinement.parameters, Parameters):
+            raise RemoteWireError(f"{name_of(refinement)}: of another profile than the scan was opened with")
         shape = self.shapes[refinement.channel]
         held, rank = self.holdings.channels[refinement.channel], _rank(refinement)
         planned_over = ChannelHoldings.coarse(shape) if refinement.self_contained else held
         chosen = select(build_lattice(shape, refinement.parameters), planned_over, rank)
         expected = chosen[0].samples if chosen else 0
         if chosen is None or expected != refinement.samples:
-            raise HoldingsDiffer(f"{_name(refinement)}: {refinement.samples} samples, {expected} expected")
+            raise HoldingsDiffer(f"{name_of(refinement)}: {refinement.samples} samples, {expected} expected")
         return _only_finer(*chosen, held, rank) if refinement.self_contained else chosen
 
 
@@ -183,9 +193,10 @@ def _decode_range(refinement: Refinement, shape: tuple[int, int]) -> StepArray:
     return decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape, refinement.quality)
 
 
-def _decode_texture(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:
+def texture_of(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:
+    """Transmitted texels, shape + (3,). Raises CodecError, RemoteWireError."""
     if refinement.mask:
-        raise RemoteWireError(f"{_name(refinement)}: texture has no voids of its own")
+        raise RemoteWireError(f"{name_of(refinement)}: texture has no voids of its own")
     codec = _codec(TextureCodec, refinement.codec)
     return decode_texture(refinement.payload, codec, refinement.quality, shape)
 
@@ -201,7 +212,8 @@ def _rank(refinement: Refinement) -> int:
     return rank_of(refinement.quality)
 
 
-def _name(refinement: Refinement) -> str:
+def name_of(refinement: Refinement) -> str:
+    """The refinement, for messages."""
     return f"refinement {refinement.seq} ({refinement.channel.name.lower()})"
 
 

@@ -7,6 +7,7 @@ on from there, at the number we named.
 
 from __future__ import annotations
 
+from client.classic_model import ClassicModel
 from client.errors import HoldingsDiffer
 from client.model import Applied, Model
 from protocol.errors import RemoteWireError
@@ -24,7 +25,7 @@ class Replica:
     """
 
     def __init__(self, opened: Opened) -> None:
-        self.model = Model(opened.scan)
+        self.model = ClassicModel(opened.scan) if opened.scan.profile == "classic" else Model(opened.scan)
         self.epoch = opened.epoch
         self.request = opened.request
         self.next_seq = 0
@@ -60,7 +61,7 @@ class Replica:
     def acknowledge(self) -> Ack:
         """What to say when everything sent so far is applied."""
         apply_ms, self._apply_s = 1000 * self._apply_s, 0.0
-        return Ack(self.epoch, self.next_seq, self.model.holdings.digest(), min(apply_ms, APPLY_MS_MAX))
+        return Ack(self.epoch, self.next_seq, self.model.digest(), min(apply_ms, APPLY_MS_MAX))
 
     def object(self) -> State | None:
         """What to say to a refinement that does not fit; None when we said it and the node has not gone on yet."""

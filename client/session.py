@@ -11,12 +11,13 @@ import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar, overload
 from weakref import WeakSet
 
 import aiohttp
 import msgspec
 
+from client.classic_model import ClassicModel
 from client.discovery import NodeAddress
 from client.errors import NodeLost, RequestRefused
 from client.live import LiveFeed, LiveFrame
@@ -125,20 +126,36 @@ class Session:
         )
 
     def holdings(self, channel: Literal["range", "texture"]) -> Held:
-        """What both ends agree we hold of a channel, as copies. Raises LocalWireError when no scan is open."""
-        held = self._opened_model().holdings.channels[Channel[channel.upper()]]
+        """What both ends agree we hold of a channel, as copies.
+
+        Raises LocalWireError when no scan is open, or one with the classic profile, which has owners instead.
+        """
+        model = self._opened_model()
+        if isinstance(model, ClassicModel):
+            raise LocalWireError("a classic model has owners, not levels: see model.owner and model.spacing")
+        held = model.holdings.channels[Channel[channel.upper()]]
         return Held(held.level.copy(), held.rank.copy())
 
-    async def open(self, scan: str = "latest") -> Model:
+    @overload
+    async def open(self, scan: str = "latest") -> Model: ...
+
+    @overload
+    async def open(self, scan: str = "latest", *, profile: Literal["classic"]) -> ClassicModel: ...
+
+    @overload
+    async def open(self, scan: str = "latest", *, profile: m.Profile) -> Model: ...
+
+    async def open(self, scan: str = "latest", *, profile: m.Profile = "default") -> Model:
         """Bind a scan ("latest" or an id) to the session and return its model once the first view is in.
 
+        profile : how it is refined from then on; "classic" is the paper's letter, to reproduce it.
         Looks that are not answered yet end as superseded. Raises RequestRefused for an unknown scan.
         """
         request = self._new_request()
         answer: asyncio.Future[Model] = asyncio.get_running_loop().create_future()
         self._opening[request] = answer
         try:
-            await self._send(m.Open(request, scan))
+            await self._send(m.Open(request, scan, profile=profile))
             return await answer
         finally:
             self._opening.pop(request, None)
@@ -156,19 +173,25 @@ class Session:
         fill: bool = False,
         alpha: float | None = None,
         scale: float | None = None,
-        profile: Literal["default"] = "default",
-        parameters: m.LookParameters | Mapping[str, Any] | None = None,
+        profile: m.Profile | None = None,
+        parameters: m.LookParameters | m.ClassicLookParameters | Mapping[str, Any] | None = None,
     ) -> Update:
         """Refine the model round (u, v), both in [0, 1), and return once it holds what was asked for.
 
         window : share of the area.      texture_db, range_mm : stop at this quality in it, or at a budget of
         max_wait_s or max_bytes, whichever comes first; fill : spend what is left of it on the periphery.
         alpha : how fast detail falls off outside the window; scale : the window as a share of each axis instead.
-        parameters : explicit sampling instead of the node's choice, as LookParameters or as the mapping of its JSON.
+        profile : the one the scan was opened with, to be sure of it.
+        parameters : explicit sampling instead of the node's choice, as LookParameters (classic: ClassicLookParameters)
+        or as the mapping of its JSON. A classic look knows alpha, scale (the paper's sigma), these and the budget only;
+        without a scale it takes the largest that fits.
         A newer look supersedes an older one, which then returns early with reason "superseded".
         Raises LocalWireError for values out of bounds, RequestRefused, NodeLost, RemoteWireError.
         """
-        self._opened_model()
+        bound = self._opened_model().info.profile
+        if profile not in (None, bound):
+            raise LocalWireError(f"look: the scan is open with the {bound} profile, not {profile!r}: open it anew")
+        classic = bound == "classic"
         request = self._new_request()
         look = _checked_look(
             m.Look(
@@ -183,8 +206,9 @@ class Session:
                 fill,
                 alpha,
                 scale,
-                profile,
-                parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
+                bound,
+                None if classic else parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
+                parameters if classic else None,  # type: ignore[arg-type]
             )
         )
         answer: asyncio.Future[Update] = asyncio.get_running_loop().create_future()

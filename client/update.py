@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from client.model import Applied
+from protocol.classic import ClassicParameters
 from protocol.grid import IntArray
 from protocol.lattice import Channel, Parameters
 from protocol.messages import Updated
@@ -19,10 +20,13 @@ ChannelName = Literal["range", "texture"]
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """One refinement as it travelled. quality : range, quantum in steps; texture, 0..255. codec : id on the wire."""
+    """One refinement as it travelled.
+
+    quality : range, quantum in steps; texture, 0..255, classic: the JPEG's Q.     codec : id on the wire.
+    """
 
     channel: ChannelName
-    parameters: Parameters
+    parameters: Parameters | ClassicParameters
     quality: int
     codec: int
     samples: int
@@ -30,7 +34,7 @@ class Sent:
 
     @property
     def p(self) -> float:
-        """Plateau spacing. [source samples]"""
+        """Plateau spacing; classic: the first spacing beside the fovea, of the wider axis. [source samples]"""
         return self.parameters.spacing
 
 

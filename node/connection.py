@@ -17,6 +17,9 @@ from functools import partial
 from aiohttp import WSMsgType, web
 
 from node.auth import Auth
+from node.classic import ClassicCoded, ClassicState
+from node.classic_planner import ClassicUpdate, plan_classic
+from node.coded import Coded
 from node.exhibits import Exhibits
 from node.foveate import Update, plan_update
 from node.library import Scan
@@ -45,7 +48,7 @@ class _Bound:
 
     epoch: int
     scan: Scan
-    state: ClientState
+    state: ClientState | ClassicState
     next_seq: int
 
 
@@ -192,7 +195,7 @@ class Connection:
         bound = self._bound
         if bound is None or said.epoch != bound.epoch:
             return
-        _adopt_word(bound.state, said.holdings)
+        _adopt_word(bound, said)
         bound.next_seq = said.next_seq
         self._acknowledged.set()
 
@@ -221,11 +224,11 @@ class Connection:
 
     async def _open(self, wanted: m.Open) -> None:
         try:
-            scan, view = await self._exhibits.open(wanted.scan, self._codec)
+            scan, view = await self._exhibits.open(wanted.scan, self._codec, wanted.profile)
             self._epoch = (self._epoch + 1) & 0xFFFF
             bound = _Bound(self._epoch, scan, view.state.copy(), 0)
             if wanted.holdings is not None:
-                _adopt_word(bound.state, wanted.holdings)
+                _adopt_holdings(bound.state, wanted.holdings)
         except LibraryError as error:
             await self._send(m.Refused(wanted.request, "not found", str(error)[:500]))
             return
@@ -261,7 +264,7 @@ class Connection:
         self._rate.encoded(spent_s)
         await self._send_update(bound, look, update, spent_s)
 
-    async def _plan(self, bound: _Bound, look: m.Look) -> Update:
+    async def _plan(self, bound: _Bound, look: m.Look) -> Update | ClassicUpdate:
         budget = look.max_bytes
         if look.max_wait_s is not None:
             affordable = self._rate.budget_bytes(look.max_wait_s)
@@ -270,19 +273,27 @@ class Connection:
         def superseded() -> bool:
             return self._look is not None or self._running_look is not look
 
+        classic = isinstance(bound.state, ClassicState)
+        if classic != (look.profile == "classic"):
+            raise LatticeError(f"the scan is not open with the {look.profile} profile")
+        if isinstance(bound.state, ClassicState):
+            return await self._exhibits.work(partial(plan_classic, bound.scan, bound.state, look, budget, superseded))
         model = self._exhibits.texture_model(bound.scan)
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
         job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded, model, quick)
         return await self._exhibits.work(job)
 
-    async def _send_update(self, bound: _Bound, look: m.Look, update: Update, spent_s: float) -> None:
+    async def _send_update(
+        self, bound: _Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float
+    ) -> None:
         bound.state = update.state
         if update.coded:
             self._acknowledged.clear()
             self._begin_timing()
         first_seq = bound.next_seq
         bound.next_seq += len(update.coded)  # at once: what is said meanwhile counts all of them
-        for seq, coded in enumerate(update.coded, first_seq):
+        refinements: tuple[Coded | ClassicCoded, ...] = update.coded
+        for seq, coded in enumerate(refinements, first_seq):
             await self._send_bytes(coded.refinement(bound.epoch, seq, look.request).to_bytes())
         await self._send(
             m.Updated(
@@ -328,8 +339,20 @@ class Connection:
             await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=why.encode()[:120])
 
 
-def _adopt_word(state: ClientState, said: m.Statement) -> None:
+def _adopt_word(bound: _Bound, said: m.State) -> None:
     """Take the client's word for what it holds. Raises RemoteWireError when it is no statement of this scan."""
+    if not isinstance(bound.state, ClassicState):
+        _adopt_holdings(bound.state, said.holdings)
+        return
+    try:
+        bound.state = bound.state.at(said.next_seq)
+    except LatticeError as error:
+        raise RemoteWireError(f"state: {error}") from None
+
+
+def _adopt_holdings(state: ClientState | ClassicState, said: m.Statement) -> None:
+    if isinstance(state, ClassicState):
+        raise RemoteWireError("a classic opening begins with its first view, not with holdings")
     try:
         channels = {
             Channel.RANGE: ChannelHoldings.from_runs(state.shapes[Channel.RANGE], said.range),

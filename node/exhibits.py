@@ -7,17 +7,20 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import TypeVar, overload
 
+from node.classic import ClassicView, build_classic_view
 from node.first_view import FirstView, build_first_view
 from node.library import Library, Scan
 from node.texture_model import TextureModel
 from protocol.errors import LibraryError
-from protocol.messages import CodecName
+from protocol.messages import CodecName, Profile
 
 VIEWS_MAX = 8
 MODELS_MAX = 8
 T = TypeVar("T")
+Key = tuple[str, CodecName, Profile]
+Opening = tuple[Scan, FirstView | ClassicView]
 
 
 class Exhibits:
@@ -27,14 +30,20 @@ class Exhibits:
         self.library = library
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="encode")
-        self._views: OrderedDict[tuple[str, CodecName], asyncio.Future[tuple[Scan, FirstView]]] = OrderedDict()
+        self._views: OrderedDict[Key, asyncio.Future[Opening]] = OrderedDict()
         self._closing = threading.Event()
         self._surveyor = ThreadPoolExecutor(1, thread_name_prefix="survey")
         self._models: OrderedDict[str, Future[TextureModel]] = OrderedDict()
 
-    async def open(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]:
+    @overload
+    async def open(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]: ...
+
+    @overload
+    async def open(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening: ...
+
+    async def open(self, scan_id: str, codec: CodecName, profile: Profile = "default") -> Opening:
         """A scan ("latest" or an id) and its first view. Raises LibraryError when there is none such."""
-        key = self.resolve(scan_id), codec
+        key: Key = self.resolve(scan_id), codec, profile
         future = self._views.get(key)
         if future is None:
             future = asyncio.ensure_future(self.work(lambda: self._build(*key)))
@@ -88,6 +97,8 @@ class Exhibits:
                 self._models.popitem(last=False)[1].cancel()
         self._models.move_to_end(scan.id)
 
-    def _build(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]:
+    def _build(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening:
         scan = self.library.open(scan_id)
+        if profile == "classic":
+            return scan, build_classic_view(scan, codec)
         return scan, build_first_view(scan, codec, self._first_view_bytes)

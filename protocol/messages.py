@@ -22,6 +22,8 @@ REASON_MAX = 200  # of what a decoder says, which may quote what it was given
 
 Unit = Annotated[float, Meta(ge=0, lt=1)]
 Share = Annotated[float, Meta(gt=0, le=1)]
+Alpha = Annotated[float, Meta(ge=0.005, le=4)]
+Scale = Annotated[float, Meta(ge=0.01, le=10000)]
 Seconds = Annotated[float, Meta(ge=0.05, le=30)]
 ByteCount = Annotated[int, Meta(ge=0, le=1 << 40)]
 Count = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
@@ -34,6 +36,7 @@ Runs = Annotated[list[Run], Meta(max_length=RUNS_MAX)]
 Columns = Annotated[int, Meta(ge=1, le=WIDTH_MAX)]
 Rows = Annotated[int, Meta(ge=1, le=HEIGHT_MAX)]
 CodecName = Literal["jpeg", "htj2k"]
+Profile = Literal["default", "classic"]
 
 
 class _Part(msgspec.Struct, frozen=True, rename="camel", omit_defaults=True):
@@ -45,7 +48,10 @@ class _Message(_Part, frozen=True, tag_field="type", tag=lambda name: name[0].lo
 
 
 class ScanInfo(_Part, frozen=True):
-    """What a client must know of a scan before its first view. Lengths in mm, angle in rad."""
+    """What a client must know of a scan before its first view. Lengths in mm, angle in rad.
+
+    profile : how it is refined, which decides the first view too.
+    """
 
     id: ShortText
     width: Columns
@@ -62,6 +68,7 @@ class ScanInfo(_Part, frozen=True):
     theta0_rad: float
     created: ShortText = ""
     geometry: Literal["cylinder"] = "cylinder"
+    profile: Profile = "default"
 
     def spec(self) -> GridSpec:
         """Geometry of the scan. Raises RemoteWireError when it makes no sense."""
@@ -104,6 +111,30 @@ class LookParameters(_Part, frozen=True):
 
     range: RangeParameters | None = None
     texture: TextureParameters | None = None
+
+
+class ClassicRange(_Part, frozen=True):
+    """A classic fovea's range: alpha, its scale as s or sigma (share of an axis kept); neither: the node chooses."""
+
+    alpha: Alpha = 0.1
+    s: Scale | None = None
+    sigma: Share | None = None
+
+
+class ClassicTexture(_Part, frozen=True):
+    """A classic fovea's texture, likewise; q is the JPEG's Q."""
+
+    alpha: Alpha = 0.03
+    s: Scale | None = None
+    sigma: Share | None = None
+    q: Annotated[int, Meta(ge=10, le=95)] = 75
+
+
+class ClassicLookParameters(_Part, frozen=True):
+    """Parameters of a look at a classic scan; a channel left out is not refined."""
+
+    range: ClassicRange | None = None
+    texture: ClassicTexture | None = None
 
 
 # From the node
@@ -223,11 +254,12 @@ class Statement(_Part, frozen=True):
 
 
 class Open(_Message, frozen=True):
-    """Bind a scan ("latest" or an id). With holdings, no first view is sent: go on from there."""
+    """Bind a scan ("latest" or an id). With holdings (not classic), no first view is sent: go on from there."""
 
     request: Count
     scan: ShortText
     holdings: Statement | None = None
+    profile: Profile = "default"
 
 
 class Look(_Message, frozen=True):
@@ -236,6 +268,8 @@ class Look(_Message, frozen=True):
     window : share of the area.  texture_db, range_mm : quality to stop at.  fill : spend what is left on the periphery.
     alpha : how fast detail falls off outside the window (S' = 1 / (alpha p)); null: the node's choice.
     scale : the window as a share of each axis, instead of `window`.
+    profile : the one the scan was opened with. A classic look takes alpha, scale (as sigma), `classic` parameters
+    instead of both, and the budget, nothing else.
     """
 
     request: Count
@@ -247,10 +281,11 @@ class Look(_Message, frozen=True):
     max_wait_s: Seconds | None = None
     max_bytes: ByteCount | None = None
     fill: bool = False
-    alpha: Annotated[float, Meta(ge=0.005, le=4)] | None = None
+    alpha: Alpha | None = None
     scale: Share | None = None
-    profile: Literal["default"] = "default"
+    profile: Profile = "default"
     parameters: LookParameters | None = None
+    classic: ClassicLookParameters | None = None
 
 
 class Ack(_Message, frozen=True):

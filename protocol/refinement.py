@@ -11,6 +11,7 @@ import zlib
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
 from protocol.lattice import Channel, Parameters
 
@@ -30,6 +31,7 @@ class Generator(IntEnum):
 
     COARSE = 0
     FOVEA = 1
+    CLASSIC = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ class Refinement:
 
     epoch : which opening of a scan it belongs to.      seq : counts refinements in an epoch, from 0.
     look : the request it answers, 0 for none.          codec : id of the payload's codec.
-    quality : range: quantum in steps; texture: 0..255. samples : values in the payload.
+    quality : range: quantum in steps; texture: 0..255, CLASSIC: the JPEG's Q. samples : values in the payload.
     self_contained : planned over the first view alone, not over the client's holdings.
     parameters : of the lattice; None for the first view.
     mask : range only, which cells are void; empty when none is.
@@ -54,12 +56,12 @@ class Refinement:
     samples: int
     payload: bytes = field(repr=False)
     mask: bytes = field(default=b"", repr=False)
-    parameters: Parameters | None = None
+    parameters: Parameters | ClassicParameters | None = None
     self_contained: bool = False
 
     def to_bytes(self) -> bytes:
         """Wire form. Raises LocalWireError when a part does not fit it."""
-        parameters = b"" if self.parameters is None else pack_parameters(self.parameters)
+        parameters = _packed(self.parameters)
         sizes = (len(parameters), len(self.mask), len(self.payload))
         if sizes[0] > PARAMETERS_MAX or sizes[1] > MASK_MAX or sizes[2] > PAYLOAD_MAX:
             raise LocalWireError(f"refinement too long: parameters, mask, payload of {sizes} bytes")
@@ -82,13 +84,25 @@ class Refinement:
             raise RemoteWireError(f"refinement of {len(data)} bytes announces {ends[-1] + CRC.size}")
         if CRC.unpack_from(data, ends[-1])[0] != zlib.crc32(memoryview(data)[: ends[-1]]):
             raise RemoteWireError("refinement fails its checksum")
-        parameters = unpack_parameters(data[ends[0] : ends[1]]) if sizes[0] else None
-        if (parameters is None) != (generator is Generator.COARSE):
-            raise RemoteWireError("a first view carries no lattice; everything else does")
+        parameters = _unpacked(generator, data[ends[0] : ends[1]])
         mask, payload = data[ends[1] : ends[2]], data[ends[2] : ends[3]]
         return cls(
             generator, channel, epoch, seq, look, codec, quality, samples, payload, mask, parameters, bool(flags & 1)
         )
+
+
+def _packed(parameters: Parameters | ClassicParameters | None) -> bytes:
+    if isinstance(parameters, ClassicParameters):
+        return parameters.to_bytes()
+    return b"" if parameters is None else pack_parameters(parameters)
+
+
+def _unpacked(generator: Generator, data: bytes) -> Parameters | ClassicParameters | None:
+    if bool(data) != (generator is not Generator.COARSE):
+        raise RemoteWireError("a first view carries no lattice; everything else does")
+    if generator is Generator.CLASSIC:
+        return ClassicParameters.from_bytes(data)
+    return unpack_parameters(data) if data else None
 
 
 def pack_parameters(p: Parameters) -> bytes:

@@ -324,7 +324,7 @@ def _refinements() -> dict[str, Any]:
                 "quality": refinement.quality,
                 "samples": refinement.samples,
                 "selfContained": refinement.self_contained,
-                "parameters": None if refinement.parameters is None else _parameters(refinement.parameters),
+                "parameters": _parameters(p) if isinstance(p := refinement.parameters, Parameters) else None,
                 "mask": refinement.mask.hex(),
                 "payload": refinement.payload.hex(),
             }
