@@ -160,7 +160,7 @@ class _Picture:
         self._track_of(column).take(cell, column)
 
     def progress(self, share: float, now_s: float) -> None:
-        """So much of the sweep is in. How fast the rest comes is judged since the first word: some may have been kept."""
+        """So much of the sweep is in. How fast the rest comes is judged since then: some may have been kept before."""
         self._began = self._began or (share, now_s)
         share_0, began_s = self._began
         left_s = round((1 - share) * (now_s - began_s) / (share - share_0), 1) if share > share_0 else None
