@@ -121,7 +121,7 @@ async def test_no_level_rises_over_50_looks_and_level_0_keeps_its_promise(head_n
     random = np.random.default_rng(11)
     async with connect(head_node.url) as session:
         model = await session.open()
-        levels = {channel: session.holdings(channel) for channel in ("range", "texture")}  # type: ignore[arg-type]
+        levels = {channel: session.holdings(channel) for channel in ("range", "texture")}
         for _ in range(50):
             p, quantum = int(random.choice([1, 2, 4])), int(random.choice([1, 5, 40]))
             explicit = {"range": {"p": p, "quantum": quantum}, "texture": {"p": p, "quality": 40 + 5 * p}}
