@@ -210,8 +210,9 @@ def told(record: dict[str, Any]) -> str:
     for case in record["updates"]:
         lines.append(
             f"{case['case']}: node {case['node_ms']:.1f} ms = {case['node_times_imencode']:.2f} x imencode of"
-            f" {case['patch'][1]} x {case['patch'][0]} texels (texture alone {case['texture_only_times_imencode']:.2f}),"
-            f" client {case['client_ms']:.1f} ms = {case['client_times_imdecode']:.2f} x imdecode"
+            f" {case['patch'][1]} x {case['patch'][0]} texels (texture alone"
+            f" {case['texture_only_times_imencode']:.2f}), client {case['client_ms']:.1f} ms ="
+            f" {case['client_times_imdecode']:.2f} x imdecode"
         )
     lines.append(f"encodes with the search: {record['searched']}")
     lines.append(f"first view bytes: {record['first_view_bytes']}")
@@ -238,7 +239,7 @@ def opened_model(view: FirstView) -> Model:
 
 
 def _fresh(model: Model) -> Model:
-    """The same model as if it held the first view alone (its dense arrays are shared: what they hold does not matter)."""
+    """The same model as if it held the first view alone; its dense arrays stay, since cells do not matter."""
     model.holdings = type(model.holdings).coarse(model.shapes)
     return model
 

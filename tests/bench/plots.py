@@ -1,4 +1,4 @@
-"""Bytes against quality, one picture a scan: how much a click takes as the PSNR asked for rises, ours and the rivals'."""
+"""Bytes against quality, one picture a scan: what a click takes as the PSNR asked for rises, ours and the rivals'."""
 
 from __future__ import annotations
 

@@ -40,9 +40,10 @@ def run(
     total = sum(len(looks) for looks in ours.values())
     with tqdm(total=total, desc="rivals", disable=None) as bar:
         for scan in scans:
-            for click, mine in zip(scan.clicks(clicks), ours[scan.key], strict=True):
-                row = {"scan": scan.name, "click": click, "ours": asdict(mine), "rivals": dict[str, Any]()}
-                row["crop_bytes"] = _crop_bytes(scan, click, target, mine)
+            crops = _crop_bytes(scan, clicks, target, ours[scan.key])
+            for click, mine, floor in zip(scan.clicks(clicks), ours[scan.key], crops, strict=True):
+                row: dict[str, Any] = {"scan": scan.name, "click": click, "ours": asdict(mine), "rivals": {}}
+                row["crop_bytes"] = floor
                 for rival in rivals:
                     try:
                         row["rivals"][rival] = asdict(bytes_for(rival, scan, click, target, cache))
@@ -126,7 +127,9 @@ async def _ours(scans: list[BenchScan], clicks: int, target: Target) -> dict[str
     return found
 
 
-def _crop_bytes(scan: BenchScan, click: tuple[float, float], target: Target, mine: Looked) -> int:
-    """What the rectangles of our refinements would take as exact crops."""
+def _crop_bytes(scan: BenchScan, clicks: int, target: Target, ours: list[Looked]) -> list[int]:
+    """What the rectangles of our refinements would take as exact crops, click by click."""
     with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
-        return crop_bytes(scan.published(Path(folder)), Window.round(scan.grid, click, target), mine.parts)
+        published = scan.published(Path(folder))
+        places = zip(scan.clicks(clicks), ours, strict=True)
+        return [crop_bytes(published, Window.round(scan.grid, click, target), mine.parts) for click, mine in places]

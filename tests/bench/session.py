@@ -1,4 +1,4 @@
-"""`bench session`: ten clicks on one scan, a random walk in steps of one window, against rivals that keep what they got."""
+"""`bench session`: ten clicks, a random walk in steps of one window, against rivals that keep what they got."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmarks run: one small scan, one click, the rivals that need no long search. Their figures are not judged here."""
+"""The benchmarks run: one small scan, one click, a rival that needs no long search. Figures are not judged here."""
 
 import json
 
@@ -14,37 +14,37 @@ from tests.bench.target import Target, Window
 
 
 @pytest.fixture(scope="module")
-def scan():
+def scan() -> BenchScan:
     return load("head", "S")
 
 
-def test_roi_compares_what_is_verified_with_what_is_verified(scan: BenchScan):
+def test_roi_compares_what_is_verified_with_what_is_verified(scan: BenchScan) -> None:
     record = roi.run([scan], "S", 1, Cache(None), ["JPEG tile pyramid"])
     assert record["verified"]
     assert record["rows"][0]["rivals"]["JPEG tile pyramid"]["size_bytes"] > 64
     assert "JPEG tile pyramid" in roi.told(record)
 
 
-def test_line_measures_every_part(scan: BenchScan):
+def test_line_measures_every_part(scan: BenchScan) -> None:
     record = line.run(scan, 1, 1, ["S"])
     assert record["deframing"]["mb_s"] > 0
     assert {case["case"].split(",")[0] for case in record["updates"]} == {"jpeg", "htj2k"}
     assert line.told(record)
 
 
-def test_rate_control_never_goes_over_a_limit(scan: BenchScan):
+def test_rate_control_never_goes_over_a_limit(scan: BenchScan) -> None:
     record = rate.run([scan], "S", 1)
     assert record["over"] == 0
     assert rate.told(record)
 
 
-def test_codecs_meet_the_same_target(scan: BenchScan):
+def test_codecs_meet_the_same_target(scan: BenchScan) -> None:
     record = codec.run([scan], "S", 1)
     assert all(found["db"] >= 40 for found in record["rows"][0]["texture"].values())
     assert codec.told(record)
 
 
-def test_a_scan_is_turned_so_that_a_click_stays_off_the_seam(scan: BenchScan):
+def test_a_scan_is_turned_so_that_a_click_stays_off_the_seam(scan: BenchScan) -> None:
     click = (0.01, 0.5)
     ready, place = straight(scan, click)
     there, here = Window.round(ready.grid, place, Target()), Window.round(scan.grid, click, Target())
@@ -52,7 +52,7 @@ def test_a_scan_is_turned_so_that_a_click_stays_off_the_seam(scan: BenchScan):
     assert np.array_equal(there.range_steps, here.range_steps)
 
 
-def test_the_command_prints_one_object(capsys: pytest.CaptureFixture[str]):
+def test_the_command_prints_one_object(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["bench", "codec", "--json", "--size", "S", "--specimen", "sphere", "--repeats", "1"]
     assert foveascan.main(arguments) == 0
     assert json.loads(capsys.readouterr().out)["conditions"]["cores"]

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import codec_htj2k
-from protocol.region import Region
 from tests.bench.cache import Cache
 from tests.bench.rivals import jpip, range_tiles
 from tests.bench.rivals.codestream import CodeStream, Layout
@@ -166,13 +165,10 @@ def windows_of(scan: BenchScan, clicks: list[Click], target: Target) -> Windows:
 
 
 def _jpip_channel(stream: CodeStream, windows: Windows, channel: str, free: jpip.Free) -> list[int] | None:
-    held = jpip.first_view(
-        stream, stream.layers if free.size_bytes == jpip.Free().size_bytes else _target_layers(stream), free
-    )
+    held = jpip.first_view(stream, -(-stream.layers // 2), free)  # about the quality that windows will need
     sizes = []
     for window in windows:
-        region: Region = window.texture if channel == "texture" else window.range
-        bins = jpip.precincts_over(stream, region, 0)
+        bins = jpip.precincts_over(stream, window.texture if channel == "texture" else window.range, 0)
 
         def good(
             layers: int, had: NDArray[np.bool_] = held, bins: list[list[int]] = bins, window: Window = window
@@ -189,11 +185,6 @@ def _jpip_channel(stream: CodeStream, windows: Windows, channel: str, free: jpip
         sizes.append(jpip.message_bytes(stream, wanted, held))
         held = held | wanted
     return sizes
-
-
-def _target_layers(stream: CodeStream) -> int:
-    """The layers of a first view that is limited by its bytes: those of about the quality that windows will need."""
-    return -(-stream.layers // 2)
 
 
 def _levels_for_all(scan: BenchScan, windows: Windows) -> list[Level]:
