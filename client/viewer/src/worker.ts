@@ -1,1 +1,90 @@
-export {}
+// Everything that costs time, off the page's own thread: the stream, decoding, reconstruction, thumbnails.
+
+import wasmPath from '@cornerstonejs/codec-openjph/wasm';
+import type { FromWorker, ToWorker } from './link.ts';
+import { decodeJpegNatively } from './jpeg_native.ts';
+import { Codecs } from './protocol/codec.ts';
+import { Htj2kDecoder } from './protocol/codec_htj2k.ts';
+import { Model } from './protocol/model.ts';
+import type { ScanInfo } from './protocol/messages.ts';
+import { parseRefinement } from './protocol/refinement.ts';
+import { Stream } from './stream.ts';
+import { drawThumbnail, THUMBNAIL_SIDE } from './thumbnail.ts';
+import { strings } from './strings.ts';
+import { FACING_RAD } from './facing.ts';
+
+interface Scope {
+  postMessage(message: FromWorker, transfer?: Transferable[]): void;
+  onmessage: (event: MessageEvent<ToWorker>) => void;
+  location: Location;
+}
+const scope = globalThis as unknown as Scope;
+
+// Asked for at once, so that it comes beside the first view.
+const htj2k = fetch(new URL(wasmPath, scope.location.href))
+  .then((response) => response.arrayBuffer())
+  .then((binary) => Htj2kDecoder.load(binary));
+htj2k.catch(() => undefined); // whoever awaits it hears of it
+const codecs = new Codecs(() => htj2k, decodeJpegNatively);
+
+let stream: Stream | null = null;
+let origin = '';
+
+scope.onmessage = ({ data: said }) => {
+  switch (said.kind) {
+    case 'start':
+      origin = said.origin;
+      stream = new Stream(`${origin.replace(/^http/, 'ws')}/v1/stream`, codecs, (...told) => scope.postMessage(...told), explain);
+      if (said.scan) stream.open(said.scan);
+      stream.connect();
+      break;
+    case 'open':
+      stream?.open(said.scan);
+      break;
+    case 'look':
+      stream?.look(said.look, said.u, said.v, said.options);
+      break;
+    case 'cancel':
+      stream?.cancel(said.look);
+      break;
+    case 'restore':
+      stream?.restore();
+      break;
+    case 'retry':
+      stream?.connect();
+      break;
+    case 'thumbnail':
+      void thumbnail(said.scan);
+      break;
+  }
+};
+
+/** A browser does not say why a WebSocket failed; the node's other end does. */
+async function explain(): Promise<string> {
+  try {
+    const answer = await fetch(`${origin}/v1/stream`, { cache: 'no-store' });
+    if (answer.status === 503) return ((await answer.json()) as { message: string }).message;
+    if (answer.status === 401 || answer.status === 403) return strings.link.needsToken;
+    return strings.link.cut;
+  } catch {
+    return strings.link.unreachable;
+  }
+}
+
+async function thumbnail(scan: string): Promise<void> {
+  try {
+    const [info, coarse] = await Promise.all([fetch(`${origin}/v1/scans/${scan}`), fetch(`${origin}/v1/scans/${scan}/coarse`)]);
+    if (!info.ok || !coarse.ok) return;
+    const model = new Model((await info.json()) as ScanInfo, 0);
+    const body = await coarse.arrayBuffer();
+    for (let at = 0; at < body.byteLength; ) {
+      const size = new DataView(body).getUint32(at, true);
+      await model.apply(parseRefinement(new Uint8Array(body, at + 4, size)), codecs);
+      at += 4 + size;
+    }
+    const pixels = drawThumbnail(model.info, model.coarseSteps, model.coarseTexels, FACING_RAD);
+    scope.postMessage({ kind: 'thumbnail', scan, side: THUMBNAIL_SIDE, pixels }, [pixels.buffer]);
+  } catch (error) {
+    console.warn(`no thumbnail of ${scan}`, error);
+  }
+}

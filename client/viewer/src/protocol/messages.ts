@@ -64,6 +64,7 @@ export interface Look {
   textureDb?: number;
   rangeMm?: number;
   maxWaitS?: number;
+  alpha?: number;
   maxBytes?: number;
   fill?: boolean;
 }

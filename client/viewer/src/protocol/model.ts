@@ -4,7 +4,7 @@
 import { HoldingsDiffer, RemoteWireError } from './errors.ts';
 import { Codecs } from './codec.ts';
 import { ChannelHoldings, hashBlock, Holdings, rankOf } from './holdings.ts';
-import { blockSide, buildLattice, RANGE, TEXTURE } from './lattice.ts';
+import { buildLattice, RANGE, TEXTURE } from './lattice.ts';
 import type { Channel, ChannelShape } from './lattice.ts';
 import { channelShapes } from './messages.ts';
 import type { FromClient, ScanInfo, Statement } from './messages.ts';
@@ -30,6 +30,7 @@ export class Model {
   readonly shapes: { [RANGE]: ChannelShape; [TEXTURE]: ChannelShape };
   holdings: Holdings;
   steps: Uint16Array = new Uint16Array();
+  coarseSteps: Uint16Array = new Uint16Array();
   coarseTexels: Uint8Array = new Uint8Array();
   nextSeq = 0;
   private dense: Uint32Array | null = null;
@@ -117,6 +118,7 @@ export class Model {
     if (channel === RANGE) {
       const coarse = await codecs.range(payload, codec, height, width, quality);
       await applyMask(coarse, refinement, codecs, height, width);
+      this.coarseSteps = coarse;
       this.steps = coarseToRange(coarse, shape);
     } else {
       this.coarseTexels = await codecs.texture(payload, codec, height, width, quality);
@@ -189,10 +191,4 @@ async function applyMask(
   voids.forEach((isVoid, index) => {
     if (isVoid) steps[index] = 0;
   });
-}
-
-/** Level of the block under each cell of the grid: the spacing held there is 2^(level / 2). */
-export function levelAt(held: ChannelHoldings, column: number, row: number): number {
-  const side = blockSide(held.shape);
-  return held.level[Math.floor(row / side) * Math.ceil(held.shape.width / side) + Math.floor(column / side)]!;
 }

@@ -1,0 +1,70 @@
+// What the node answers over plain HTTP.
+
+import type { Pin } from './url_state.ts';
+
+export interface ScanSummary {
+  id: string;
+  created: number;
+  name?: string | null;
+  width: number;
+  height: number;
+  textureWidth: number;
+  textureHeight: number;
+  subject?: string;
+  bodySite?: string;
+}
+
+/** What people say of a scan. */
+export interface Sidecar {
+  revision: number;
+  name: string | null;
+  subject: string;
+  body_site: string;
+  pins: Pin[];
+}
+
+export type Changes = Partial<Omit<Sidecar, 'revision'>>;
+
+export interface Capture {
+  phase: string;
+  progress?: number;
+  why?: string;
+  [more: string]: unknown;
+}
+
+/** The node said no; the message is for people. */
+export class Refused extends Error {
+  constructor(readonly status: number, message: string) {
+    super(message);
+  }
+}
+
+export const listScans = (): Promise<ScanSummary[]> => ask('GET', '/v1/scans');
+export const startSweep = (): Promise<unknown> => ask('POST', '/v1/sweeps');
+export const deleteScan = (id: string): Promise<unknown> => ask('DELETE', `/v1/scans/${id}`);
+export const readCapture = async (): Promise<Capture> => (await ask<{ capture: Capture }>('GET', '/v1/node')).capture;
+export const downloadPath = (id: string, format: string): string => `/v1/scans/${id}.${format}`;
+
+/** What is said of a scan; null where the node keeps no such thing. */
+export async function readSidecar(id: string): Promise<Sidecar | null> {
+  try {
+    return await ask<Sidecar>('GET', `/v1/scans/${id}/sidecar`);
+  } catch (error) {
+    if (error instanceof Refused && (error.status === 404 || error.status === 405)) return null;
+    throw error;
+  }
+}
+
+/** Change some of it, if nobody else has in the meantime. */
+export function changeSidecar(id: string, revision: number, changes: Changes): Promise<Sidecar> {
+  return ask('PATCH', `/v1/scans/${id}/sidecar`, changes, { 'If-Match': `"${revision}"` });
+}
+
+async function ask<T>(method: string, path: string, body?: unknown, headers: Record<string, string> = {}): Promise<T> {
+  const init: RequestInit = { method, headers, cache: 'no-store' };
+  if (body !== undefined) Object.assign(init, { body: JSON.stringify(body), headers: { ...headers, 'Content-Type': 'application/json' } });
+  const answer = await fetch(path, init);
+  if (answer.ok) return (answer.status === 204 ? null : await answer.json()) as T;
+  const said = (await answer.json().catch(() => ({}))) as { message?: string };
+  throw new Refused(answer.status, said.message ?? `${answer.status} ${answer.statusText}`);
+}

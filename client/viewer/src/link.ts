@@ -1,0 +1,61 @@
+// What the page and its worker say to each other.
+
+import type { Channel } from './protocol/lattice.ts';
+import type { ScanInfo } from './protocol/messages.ts';
+import type { Changed } from './protocol/model.ts';
+
+export interface LookOptions {
+  window: number;
+  textureDb: number;
+  rangeMm: number;
+  maxWaitS?: number;
+  alpha?: number;
+  maxBytes?: number;
+}
+
+export type ToWorker =
+  | { kind: 'start'; origin: string; scan: string | null }
+  | { kind: 'open'; scan: string }
+  | { kind: 'look'; look: number; u: number; v: number; options: LookOptions }
+  | { kind: 'cancel'; look: number }
+  | { kind: 'restore' }
+  | { kind: 'retry' }
+  | { kind: 'thumbnail'; scan: string };
+
+/** A scan as it is known now; texels that are refined follow as patches. */
+export interface Snapshot {
+  info: ScanInfo;
+  steps: Uint16Array;
+  coarseTexels: Uint8Array;
+  levels: [range: Uint8Array, texture: Uint8Array];
+}
+
+/** What one look brought and cost. */
+export interface Answer {
+  look: number;
+  reason: 'complete' | 'byte limit' | 'superseded';
+  bytes: number;
+  elapsedMs: number;
+  applyMs: number;
+  errorMaxMm: number | null;
+  textureDb: number | null;
+}
+
+export type LinkState =
+  | { state: 'connecting' }
+  | { state: 'ready'; node: string; version: string; role: string }
+  | { state: 'lost'; reason: string; retryMs: number };
+
+export type FromWorker =
+  | { kind: 'link'; link: LinkState }
+  | { kind: 'opened'; snapshot: Snapshot; fresh: boolean; bytes: number }
+  | { kind: 'patch'; channel: Channel; changed: Changed[]; level: Uint8Array }
+  | { kind: 'updated'; answer: Answer }
+  | { kind: 'refused'; look: number; code: string; message: string }
+  | { kind: 'published'; scan: string }
+  | { kind: 'liveStarted'; grid: ScanInfo }
+  | { kind: 'livePicture'; steps: Uint16Array; texels: Uint8Array }
+  | { kind: 'liveProgress'; percent: number; secondsLeft: number | null }
+  | { kind: 'liveEnded'; scan: string | null; why: string }
+  | { kind: 'thumbnail'; scan: string; side: number; pixels: Uint8ClampedArray<ArrayBuffer> }
+  | { kind: 'traffic'; received: number; sent: number };

@@ -1,0 +1,308 @@
+// The conversation with the node: connects, goes on after a cut, applies what comes in order, and tells the page.
+
+import { backoffMs } from './backoff.ts';
+import type { Answer, FromWorker, LinkState, LookOptions, Snapshot } from './link.ts';
+import { LivePicture } from './live_picture.ts';
+import type { Codecs } from './protocol/codec.ts';
+import { HoldingsDiffer, RemoteWireError } from './protocol/errors.ts';
+import { CHANNELS, TEXTURE } from './protocol/lattice.ts';
+import { isLive, parseLive } from './protocol/live.ts';
+import { parseMessage, PROTOCOL } from './protocol/messages.ts';
+import type { FromClient, FromNode, Look, Updated } from './protocol/messages.ts';
+import { Model } from './protocol/model.ts';
+import type { Changed } from './protocol/model.ts';
+import { COARSE, parseRefinement } from './protocol/refinement.ts';
+import type { Refinement } from './protocol/refinement.ts';
+
+const CLIENT = 'foveascan viewer';
+const VIOLATION = 4002;
+const PICTURE_MS = 100;
+
+interface Looking {
+  look: Look;
+  began: number;
+  bytes: number;
+  applyMs: number;
+}
+
+export type Tell = (message: FromWorker, transfer?: Transferable[]) => void;
+/** Why there is no connection, in words for people. */
+export type Explain = () => Promise<string>;
+
+export class Stream {
+  private socket: WebSocket | null = null;
+  private work: Promise<void> = Promise.resolve();
+  private attempt = 0;
+  private timer: ReturnType<typeof setTimeout> | undefined;
+  private node: { name: string; version: string } | null = null;
+  private model: Model | null = null;
+  /** The scan that the page wants to see. */
+  private wanted: string | null = null;
+  private request = 0;
+  private opening = 0;
+  private looking: Looking | null = null;
+  private applyMs = 0;
+  private firstBytes = 0;
+  private received = 0;
+  private sent = 0;
+  private picture: LivePicture | null = null;
+  private pictureTimer: ReturnType<typeof setTimeout> | undefined;
+
+  constructor(
+    private readonly url: string, private readonly codecs: Codecs, private readonly tell: Tell,
+    private readonly explain: Explain,
+  ) {}
+
+  /** Connect, and stay connected. */
+  connect(): void {
+    clearTimeout(this.timer);
+    if (this.socket) return;
+    this.link({ state: 'connecting' });
+    const socket = new WebSocket(this.url, [PROTOCOL]);
+    this.socket = socket;
+    socket.binaryType = 'arraybuffer';
+    socket.onmessage = ({ data }: MessageEvent<string | ArrayBuffer>) => {
+      this.count(data);
+      this.work = this.work.then(() => this.take(socket, data)).catch((error: unknown) => this.fail(socket, error));
+    };
+    socket.onclose = ({ reason }) => void this.lost(socket, reason);
+  }
+
+  /** Show a scan: its first view, or, where we hold it already, what is new. */
+  open(scan: string): void {
+    this.wanted = scan;
+    if (this.looking) this.answer(this.looking, 'superseded', null);
+    this.looking = null;
+    if (this.node) this.sendOpen();
+  }
+
+  /** Get detail; a look that is still in the air is superseded by a newer one. */
+  look(number: number, u: number, v: number, options: LookOptions): void {
+    const look: Look = { type: 'look', request: number, u, v, ...options };
+    if (this.looking) this.answer(this.looking, 'superseded', null);
+    this.looking = { look, began: performance.now(), bytes: 0, applyMs: 0 };
+    if (this.node && this.model?.complete) this.sendLook();
+  }
+
+  /** Forget a look. */
+  cancel(number: number): void {
+    if (this.looking?.look.request !== number) return;
+    this.say({ type: 'cancel', request: this.request });
+    this.answer(this.looking, 'superseded', null);
+    this.looking = null;
+  }
+
+  /** Tell the page all over what we hold: its graphics memory was lost. */
+  restore(): void {
+    this.work = this.work.then(() => {
+      if (!this.model?.complete) return;
+      this.tell({ kind: 'opened', snapshot: snapshotOf(this.model), fresh: false, bytes: 0 });
+      if (this.model.hasTexels) this.tellAllTexels(this.model);
+    });
+  }
+
+  private async take(socket: WebSocket, data: string | ArrayBuffer): Promise<void> {
+    if (socket !== this.socket) return;
+    if (typeof data === 'string') return this.hear(parseMessage(data), data.length);
+    const bytes = new Uint8Array(data);
+    if (isLive(bytes)) return this.showLive(bytes);
+    await this.refine(parseRefinement(bytes), bytes.length);
+  }
+
+  private hear(said: FromNode, size: number): void {
+    switch (said.type) {
+      case 'serverInfo':
+        if (said.protocol !== PROTOCOL) throw new RemoteWireError(`the node speaks ${said.protocol}, this page ${PROTOCOL}`);
+        this.node = { name: said.name, version: said.version };
+        this.say({ type: 'hello', protocol: PROTOCOL, client: CLIENT, codecs: ['htj2k', 'jpeg'] });
+        break;
+      case 'welcome':
+        this.attempt = 0;
+        this.link({ state: 'ready', node: this.node!.name, version: this.node!.version, role: said.role });
+        this.say({ type: 'watch', live: true });
+        if (this.wanted) this.sendOpen();
+        break;
+      case 'opened':
+        if (said.request === this.opening) this.bind(said);
+        break;
+      case 'updated':
+        this.close(said, size);
+        break;
+      case 'resync':
+        if (said.epoch === this.model?.epoch) this.say(this.model.state());
+        break;
+      case 'refused':
+        this.refuse(said);
+        break;
+      case 'published':
+        this.tell({ kind: 'published', scan: said.scan });
+        break;
+      case 'goodbye':
+        this.socket?.close();
+        break;
+      case 'liveStarted':
+        this.picture = new LivePicture(said.sweep, said.grid);
+        this.tell({ kind: 'liveStarted', grid: said.grid });
+        break;
+      case 'liveProgress':
+        this.tell({ kind: 'liveProgress', percent: said.percent, secondsLeft: said.secondsLeft ?? null });
+        break;
+      case 'liveEnded':
+        this.picture = null;
+        this.tell({ kind: 'liveEnded', scan: said.reason === 'published' ? (said.scan ?? null) : null, why: said.why ?? '' });
+        break;
+    }
+  }
+
+  private bind({ epoch, scan }: Extract<FromNode, { type: 'opened' }>): void {
+    if (this.model?.complete && this.model.info.id === scan.id) {
+      this.model.resume(epoch);
+      this.wanted = scan.id;
+      if (this.looking) this.sendLook();
+      return;
+    }
+    this.wanted = scan.id;
+    this.model = new Model(scan, epoch);
+    this.firstBytes = 0;
+  }
+
+  private async refine(refinement: Refinement, size: number): Promise<void> {
+    const model = this.model;
+    if (!model || refinement.epoch !== model.epoch) return; // of an opening that a newer one has overtaken
+    const began = performance.now();
+    let changed: Changed[];
+    try {
+      if (!model.isNext(refinement)) throw new HoldingsDiffer('a refinement is missing');
+      changed = await model.apply(refinement, this.codecs);
+    } catch (error) {
+      if (!(error instanceof HoldingsDiffer)) throw error;
+      this.say(model.object());
+      return;
+    }
+    const applyMs = performance.now() - began;
+    this.applyMs += applyMs;
+    if (refinement.generator === COARSE) return this.firstView(model, size);
+    if (this.looking && refinement.look === this.request) {
+      this.looking.bytes += size;
+      this.looking.applyMs += applyMs;
+    }
+    const { channel } = refinement;
+    const level = model.holdings.channels[channel].level.slice();
+    this.tell({ kind: 'patch', channel, changed, level }, changed.map(({ cells }) => cells.buffer as ArrayBuffer));
+  }
+
+  private firstView(model: Model, size: number): void {
+    this.firstBytes += size;
+    if (!model.complete) return;
+    this.acknowledge(model);
+    this.tell({ kind: 'opened', snapshot: snapshotOf(model), fresh: true, bytes: this.firstBytes });
+    if (this.looking) this.sendLook();
+  }
+
+  private close(said: Updated, size: number): void {
+    if (said.request === this.request && this.looking) {
+      this.looking.bytes += size;
+      this.answer(this.looking, said.reason, said);
+      this.looking = null;
+    }
+    const model = this.model;
+    if (!model || said.reason === 'superseded') return;
+    if (said.nextSeq > model.nextSeq) this.say(model.object());
+    else this.acknowledge(model);
+  }
+
+  private refuse({ request, code, message }: Extract<FromNode, { type: 'refused' }>): void {
+    if (request === this.request && this.looking) {
+      this.tell({ kind: 'refused', look: this.looking.look.request, code, message });
+      this.looking = null;
+      return;
+    }
+    if (request === this.opening) this.wanted = this.model?.info.id ?? null;
+    this.tell({ kind: 'refused', look: 0, code, message });
+  }
+
+  private showLive(bytes: Uint8Array): void {
+    const columns = parseLive(bytes);
+    if (!this.picture || columns.sweep !== this.picture.sweep) return;
+    this.picture.take(columns);
+    this.pictureTimer ??= setTimeout(() => {
+      this.pictureTimer = undefined;
+      if (this.picture) {
+        this.tell({ kind: 'livePicture', steps: this.picture.steps.slice(), texels: this.picture.texels.slice() });
+      }
+    }, PICTURE_MS);
+  }
+
+  private acknowledge(model: Model): void {
+    this.say(model.acknowledge(this.applyMs));
+    this.applyMs = 0;
+  }
+
+  private answer({ look, began, bytes, applyMs }: Looking, reason: Answer['reason'], said: Updated | null): void {
+    const [errorMaxMm, textureDb] = [said?.errorMaxMm ?? null, said?.textureDb ?? null];
+    const elapsedMs = performance.now() - began;
+    this.tell({ kind: 'updated', answer: { look: look.request, reason, bytes, elapsedMs, applyMs, errorMaxMm, textureDb } });
+  }
+
+  private sendOpen(): void {
+    this.opening = ++this.request;
+    const held = this.model?.complete && this.model.info.id === this.wanted ? this.model : null;
+    if (held) this.say({ type: 'open', request: this.opening, scan: held.info.id, holdings: held.statement() });
+    else this.say({ type: 'open', request: this.opening, scan: this.wanted! });
+  }
+
+  private sendLook(): void {
+    this.say({ ...this.looking!.look, request: ++this.request });
+  }
+
+  private say(message: FromClient | null): void {
+    if (!message || this.socket?.readyState !== WebSocket.OPEN) return;
+    const text = JSON.stringify(message);
+    this.sent += text.length;
+    this.socket.send(text);
+  }
+
+  private count(data: string | ArrayBuffer): void {
+    this.received += typeof data === 'string' ? data.length : data.byteLength;
+    this.tell({ kind: 'traffic', received: this.received, sent: this.sent });
+  }
+
+  private fail(socket: WebSocket, error: unknown): void {
+    console.error(error);
+    socket.close(VIOLATION, String(error).slice(0, 100));
+    void this.lost(socket, error instanceof RemoteWireError ? error.message : 'an error in this page');
+  }
+
+  private async lost(socket: WebSocket, reason: string): Promise<void> {
+    if (socket !== this.socket) return;
+    this.socket = this.node = null;
+    if (this.looking) Object.assign(this.looking, { bytes: 0, applyMs: 0 });
+    const why = reason || (await this.explain());
+    const retryMs = backoffMs(this.attempt++, Math.random());
+    this.link({ state: 'lost', reason: why, retryMs });
+    this.timer = setTimeout(() => this.connect(), retryMs);
+  }
+
+  private link(link: LinkState): void {
+    this.tell({ kind: 'link', link });
+  }
+
+  private tellAllTexels(model: Model): void {
+    const { textureWidth: width, textureHeight: height } = model.info;
+    const level = model.holdings.channels[TEXTURE].level.slice();
+    for (let y = 0; y < height; y += 256) {
+      const rows = Math.min(256, height - y);
+      const cells = new Uint8Array(model.texels.slice(y * width, (y + rows) * width).buffer);
+      this.tell({ kind: 'patch', channel: TEXTURE, changed: [{ x: 0, y, width, height: rows, cells }], level }, [cells.buffer]);
+    }
+  }
+}
+
+function snapshotOf(model: Model): Snapshot {
+  const [range, texture] = CHANNELS.map((channel) => model.holdings.channels[channel].level.slice());
+  return {
+    info: model.info, steps: model.steps.slice(), coarseTexels: model.coarseTexels.slice(),
+    levels: [range!, texture!],
+  };
+}
+

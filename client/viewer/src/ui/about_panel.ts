@@ -1,0 +1,74 @@
+import { downloadPath } from '../api.ts';
+import type { Changes, Sidecar } from '../api.ts';
+import type { ScanInfo } from '../protocol/messages.ts';
+import { strings } from '../strings.ts';
+import { h, refill, section } from './dom.ts';
+
+/** The scan that is open: its name and place, downloads, deletion. */
+export class AboutPanel {
+  readonly element: HTMLElement;
+  private readonly samples = h('p', { class: 'quiet' });
+  private readonly downloads = h('ul', { class: 'downloads' });
+  private readonly inputs: Record<'name' | 'subject' | 'body_site', HTMLInputElement>;
+  private readonly form: HTMLFormElement;
+  private readonly dialog: HTMLDialogElement;
+  private readonly remove: HTMLButtonElement;
+  private readonly copied = h('p', { class: 'quiet', role: 'status' });
+
+  constructor(save: (changes: Changes) => void, remove: () => void) {
+    const { about } = strings;
+    this.inputs = { name: text(200), subject: text(64), body_site: text(100) };
+    const submit = (event: Event) => {
+      event.preventDefault();
+      const { name, subject, body_site } = this.inputs;
+      save({ name: name.value.trim(), subject: subject.value.trim(), body_site: body_site.value.trim() });
+    };
+    this.form = h('form', { submit },
+      h('label', {}, about.name, this.inputs.name), h('label', {}, about.subject, this.inputs.subject),
+      h('label', {}, about.site, this.inputs.body_site), h('button', { type: 'submit', class: 'secondary' }, about.save));
+    const close = () => this.dialog.close();
+    const yes = () => {
+      close();
+      remove();
+    };
+    this.dialog = h('dialog', { 'aria-labelledby': 'sure' }, h('article', {}, h('p', { id: 'sure' }, about.sure),
+      h('footer', { class: 'row' }, h('button', { type: 'button', class: 'secondary', click: close }, about.no),
+        h('button', { type: 'button', class: 'danger', click: yes }, about.yes))));
+    this.remove = h('button', { type: 'button', class: 'secondary outline', click: () => this.dialog.showModal() }, about.remove);
+    const copy = h('button', { type: 'button', class: 'secondary outline', click: () => void this.copy() }, about.copy);
+    this.element = section(about.heading, false, this.samples, this.form,
+      h('p', { class: 'label' }, about.download), this.downloads, copy, this.copied, this.remove, this.dialog);
+    this.element.hidden = true;
+  }
+
+  show(info: ScanInfo): void {
+    this.element.hidden = false;
+    this.samples.textContent = strings.about.samples(info.width, info.height, info.textureWidth, info.textureHeight);
+    refill(this.downloads, ...Object.entries(strings.about.formats).map(([format, name]) =>
+      h('li', {}, h('a', { href: downloadPath(info.id, format), download: '' }, name))));
+    this.copied.textContent = '';
+  }
+
+  hide(): void {
+    this.element.hidden = true;
+  }
+
+  /** What is said of it; null where this node keeps no such thing. */
+  said(sidecar: Sidecar | null, role: string): void {
+    this.form.hidden = !sidecar || role === 'view';
+    this.remove.hidden = !sidecar || role !== 'admin';
+    if (!sidecar) return;
+    for (const name of ['name', 'subject', 'body_site'] as const) this.inputs[name].value = sidecar[name] ?? '';
+  }
+
+  private async copy(): Promise<void> {
+    try {
+      await navigator.clipboard.writeText(location.href);
+      this.copied.textContent = strings.about.copied;
+    } catch {
+      this.copied.textContent = strings.about.address; // no clipboard over plain HTTP
+    }
+  }
+}
+
+const text = (most: number): HTMLInputElement => h('input', { type: 'text', maxlength: most, autocomplete: 'off' });

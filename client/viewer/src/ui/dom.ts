@@ -1,0 +1,36 @@
+// Elements in few words. No markup as text, ever: a strict policy and no injection.
+
+type Attributes = Record<string, string | number | boolean | null | ((event: Event) => void)>;
+type Child = Node | string | null;
+
+/** An element. Attributes that are functions are listeners; true is an empty attribute, false and null none. */
+export function h<K extends keyof HTMLElementTagNameMap>(
+  tag: K, attributes: Attributes = {}, ...children: Child[]
+): HTMLElementTagNameMap[K] {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (typeof value === 'function') element.addEventListener(name, value);
+    else if (value !== null && value !== false) element.setAttribute(name, value === true ? '' : String(value));
+  }
+  element.append(...children.filter((child): child is Node | string => child !== null));
+  return element;
+}
+
+/** A labelled choice of one of several. */
+export function choice(
+  label: string, options: Record<string, string>, chosen: string, changed: (value: string) => void,
+): HTMLLabelElement {
+  const select = h('select', { change: () => changed(select.value) });
+  for (const [value, text] of Object.entries(options)) select.append(h('option', { value, selected: value === chosen }, text));
+  return h('label', {}, label, select);
+}
+
+/** A part of the side panel that folds. */
+export function section(heading: string, open: boolean, ...children: Child[]): HTMLDetailsElement {
+  return h('details', { open }, h('summary', {}, heading), h('div', { class: 'fold' }, ...children));
+}
+
+/** Put these children in place of all others. */
+export function refill(element: Element, ...children: Child[]): void {
+  element.replaceChildren(...children.filter((child): child is Node | string => child !== null));
+}

@@ -1,0 +1,41 @@
+import type { Capture } from '../api.ts';
+import { strings } from '../strings.ts';
+import { h, section } from './dom.ts';
+
+/** What the scanner does, and the button that makes it sweep. */
+export class ScannerPanel {
+  readonly element: HTMLElement;
+  private readonly phase = h('p', { class: 'quiet' });
+  private readonly progress = h('progress', { max: 100, 'aria-label': strings.scanner.progress, hidden: true });
+  private readonly button: HTMLButtonElement;
+  private mayOperate = true;
+
+  constructor(start: () => void) {
+    this.button = h('button', { type: 'button', click: start }, strings.scanner.start);
+    this.element = section(strings.scanner.heading, true, this.phase, this.progress, this.button);
+  }
+
+  /** Only operators may start sweeps. */
+  allow(role: string): void {
+    this.mayOperate = role !== 'view';
+    this.button.hidden = !this.mayOperate;
+  }
+
+  show(capture: Capture): void {
+    const text = strings.scanner.phases[capture.phase] ?? capture.phase;
+    this.phase.textContent = capture.why && capture.phase !== 'ready' && capture.phase !== 'sweeping' ? `${text}: ${capture.why}` : text;
+    this.button.disabled = capture.phase !== 'ready';
+    if (capture.phase !== 'sweeping') this.progress.hidden = true;
+  }
+
+  sweeping(percent: number, secondsLeft: number | null): void {
+    this.button.disabled = true;
+    this.progress.hidden = false;
+    this.progress.value = percent;
+    this.phase.textContent = strings.view.live(percent, secondsLeft);
+  }
+
+  ended(): void {
+    this.progress.hidden = true;
+  }
+}

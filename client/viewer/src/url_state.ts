@@ -1,0 +1,64 @@
+// What the page's address holds, so that a link reproduces a view: scan, camera, foveae, pins.
+
+import type { CameraPlace } from './view/stage.ts';
+import type { Place } from './view/pick.ts';
+
+export interface Pin extends Place {
+  label: string;
+}
+
+export interface ViewState {
+  scan: string | null;
+  camera: CameraPlace | null;
+  foveae: Place[];
+  pins: Pin[];
+}
+
+const FOVEAE_MAX = 24;
+const PINS_MAX = 100;
+const LABEL_MAX = 200;
+
+/** The fragment of an address, without '#'. */
+export function formatState({ scan, camera, foveae, pins }: ViewState): string {
+  const fields = new URLSearchParams();
+  if (scan) fields.set('scan', scan);
+  if (camera) {
+    const { azimuth, elevation, distance, target } = camera;
+    fields.set('camera', [azimuth.toFixed(4), elevation.toFixed(4), ...[distance, ...target].map((mm) => mm.toFixed(2))].join(','));
+  }
+  for (const { u, v } of foveae.slice(-FOVEAE_MAX)) fields.append('fovea', `${u.toFixed(5)},${v.toFixed(5)}`);
+  for (const { u, v, label } of pins.slice(0, PINS_MAX)) fields.append('pin', `${u.toFixed(5)},${v.toFixed(5)},${label}`);
+  return fields.toString();
+}
+
+/** Inverse of formatState; what makes no sense is left out. */
+export function parseState(fragment: string): ViewState {
+  const fields = new URLSearchParams(fragment);
+  const scan = fields.get('scan');
+  return {
+    scan: scan && /^[\w-]{1,200}$/.test(scan) ? scan : null,
+    camera: parseCamera(fields.get('camera')),
+    foveae: fields.getAll('fovea').slice(-FOVEAE_MAX).flatMap((text) => parsePlace(text) ?? []),
+    pins: fields.getAll('pin').slice(0, PINS_MAX).flatMap((text) => parsePin(text) ?? []),
+  };
+}
+
+function parseCamera(text: string | null): CameraPlace | null {
+  const numbers = text?.split(',').map(Number) ?? [];
+  if (numbers.length !== 6 || !numbers.every(Number.isFinite) || numbers[2]! <= 0) return null;
+  const [azimuth, elevation, distance, ...target] = numbers as [number, number, number, number, number, number];
+  return { azimuth, elevation, distance, target };
+}
+
+function parsePlace(text: string): Place | null {
+  const [u, v, ...rest] = text.split(',').map(Number);
+  return rest.length === 0 && isShare(u) && isShare(v) ? { u, v } : null;
+}
+
+function parsePin(text: string): Pin | null {
+  const [u, v, ...label] = text.split(',');
+  const place = parsePlace(`${u},${v}`);
+  return place && { ...place, label: label.join(',').slice(0, LABEL_MAX) };
+}
+
+const isShare = (value: number | undefined): value is number => value !== undefined && value >= 0 && value < 1;

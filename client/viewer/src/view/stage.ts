@@ -1,0 +1,292 @@
+// The picture: renderer, camera and controls, one surface; drawn only when something has changed.
+
+import { PerspectiveCamera, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from 'three';
+import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
+import type { Snapshot } from '../link.ts';
+import type { Channel } from '../protocol/lattice.ts';
+import type { Changed } from '../protocol/model.ts';
+import { FACING_RAD } from '../facing.ts';
+import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
+import { locate, pick } from './pick.ts';
+import type { Place } from './pick.ts';
+import { Surface } from './surface.ts';
+import type { Shading } from './surface.ts';
+import type { Detail } from './tiles.ts';
+
+const HARDWARE: Detail = { cellPx: 2, trianglesMax: 3e6 };
+const SOFTWARE: Detail = { cellPx: 7, trianglesMax: 1.5e5 };
+const SLOW_FRAME_MS = 40;
+const QUICK_FRAME_MS = 22;
+const PACE_MAX = 6;
+const TURN_STEP_RAD = Math.PI / 24;
+const ZOOM_STEP = 1.2;
+
+/** Where the camera stands: angles [rad], distance and target [mm]. */
+export interface CameraPlace {
+  azimuth: number;
+  elevation: number;
+  distance: number;
+  target: [number, number, number];
+}
+
+export interface StageEvents {
+  /** A picture was drawn: marks on it must move along. */
+  drawn(): void;
+  /** The camera has come to rest. */
+  settled(): void;
+  /** Graphics memory was lost, and is there again: everything must be shown anew. */
+  restored(): void;
+  lost(): void;
+}
+
+export class Stage {
+  readonly software: boolean;
+  private readonly renderer: WebGLRenderer;
+  private readonly scene = new Scene();
+  private readonly camera = new PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 1, 1000);
+  private readonly controls: OrbitControls;
+  private surface: Surface | null = null;
+  private shading: Shading = 'lit';
+  private overlay: Channel | null = null;
+  private asked = false;
+  private moving = false;
+  private pace = 1;
+  private lastMs = 0;
+  private settling: ReturnType<typeof setTimeout> | undefined;
+
+  constructor(private readonly canvas: HTMLCanvasElement, private readonly events: StageEvents, calm: boolean) {
+    this.software = drawsInSoftware(canvas);
+    this.renderer = new WebGLRenderer({ canvas, alpha: true, antialias: !this.software, powerPreference: 'high-performance' });
+    this.renderer.setClearColor(0, 0);
+    this.controls = new OrbitControls(this.camera, canvas);
+    Object.assign(this.controls, { enableDamping: !calm, dampingFactor: 0.12, zoomToCursor: true, rotateSpeed: 0.7 });
+    this.controls.addEventListener('change', () => this.draw());
+    this.controls.addEventListener('start', () => this.move(true));
+    this.controls.addEventListener('end', () => this.move(false));
+    canvas.addEventListener('webglcontextlost', (event) => {
+      event.preventDefault();
+      this.events.lost();
+    });
+    canvas.addEventListener('webglcontextrestored', () => this.events.restored());
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement!);
+    this.resize();
+  }
+
+  /** Show a scan. framed: with the camera where it sees everything; else it stays. */
+  show({ info, ...state }: Snapshot, framed: boolean): void {
+    const old = this.surface;
+    this.surface = new Surface(this.renderer, info, state, !this.software);
+    this.surface.show(this.shading, this.overlay);
+    this.scene.add(this.surface.object);
+    if (old) {
+      this.scene.remove(old.object);
+      old.dispose();
+    }
+    if (framed) this.frame();
+    this.draw();
+  }
+
+  /** Take rectangles that have changed. */
+  patch(channel: Channel, changed: Changed[], level: Uint8Array): void {
+    this.surface?.patch(channel, changed, level);
+    this.draw();
+  }
+
+  /** Show a newer picture of a running sweep. */
+  replace(steps: Uint16Array, coarseTexels: Uint8Array): void {
+    this.surface?.replace(steps, coarseTexels);
+    this.draw();
+  }
+
+  /** Show nothing. */
+  clear(): void {
+    if (!this.surface) return;
+    this.scene.remove(this.surface.object);
+    this.surface.dispose();
+    this.surface = null;
+    this.draw();
+  }
+
+  setLook(shading: Shading, overlay: Channel | null): void {
+    [this.shading, this.overlay] = [shading, overlay];
+    this.surface?.show(shading, overlay);
+    this.draw();
+  }
+
+  /** How many texels stand for one, each way, because the graphics card takes no larger texture; 1 is all. */
+  get shrunk(): number {
+    return this.surface?.shrunk ?? 1;
+  }
+
+  /** Put the camera where it sees the whole scan from the front. wide: the smallest distance used for a live sweep. */
+  frame(): void {
+    if (!this.surface) return;
+    const bounds = boundsOf(this.surface.info, this.surface.steps);
+    const middle = (bounds.bottomMm + bounds.topMm) / 2;
+    this.place({
+      azimuth: FACING_RAD, elevation: 0.1, distance: fittingDistance(bounds, this.camera.aspect), target: [0, middle, 0],
+    });
+  }
+
+  /** Put the camera where a sweep to come will fit, of which only the geometry is known. */
+  frameEmpty(radiusMm: number): void {
+    if (!this.surface) return;
+    const { zMaxMm, height, pitchMm } = this.surface.info;
+    const bounds = { radiusMm, topMm: zMaxMm, bottomMm: zMaxMm - height * pitchMm };
+    const target: [number, number, number] = [0, (bounds.topMm + bounds.bottomMm) / 2, 0];
+    this.place({ azimuth: FACING_RAD, elevation: 0.1, distance: fittingDistance(bounds, this.camera.aspect), target });
+  }
+
+  place({ azimuth, elevation, distance, target }: CameraPlace): void {
+    const flat = Math.cos(elevation) * distance;
+    this.controls.target.set(...target);
+    this.camera.position.set(flat * Math.cos(azimuth), Math.sin(elevation) * distance, -flat * Math.sin(azimuth));
+    this.camera.position.add(this.controls.target);
+    this.controls.update();
+    this.draw();
+  }
+
+  get placed(): CameraPlace {
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const distance = offset.length();
+    return {
+      azimuth: Math.atan2(-offset.z, offset.x), elevation: Math.asin(offset.y / distance), distance,
+      target: this.controls.target.toArray(),
+    };
+  }
+
+  /** Turn the camera by steps round the scan and up. */
+  turn(across: number, up: number): void {
+    const now = this.placed;
+    const elevation = Math.min(Math.max(now.elevation + up * TURN_STEP_RAD, -1.5), 1.5);
+    this.place({ ...now, azimuth: now.azimuth + across * TURN_STEP_RAD, elevation });
+    this.settle();
+  }
+
+  /** Come nearer by steps, or go away. */
+  zoom(steps: number): void {
+    const now = this.placed;
+    this.place({ ...now, distance: now.distance / ZOOM_STEP ** steps });
+    this.settle();
+  }
+
+  /** Move the picture by steps of a tenth of its height. */
+  pan(right: number, up: number): void {
+    const now = this.placed;
+    const stepMm = (now.distance * Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360)) / 5;
+    const across = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0).multiplyScalar(right * stepMm);
+    const along = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 1).multiplyScalar(up * stepMm);
+    const target = new Vector3(...now.target).add(across).add(along).toArray();
+    this.place({ ...now, target });
+    this.settle();
+  }
+
+  /** The place under a point of the page, or null. */
+  pick(clientX: number, clientY: number): Place | null {
+    if (!this.surface) return null;
+    const box = this.canvas.getBoundingClientRect();
+    const at = new Vector2(((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2);
+    this.camera.updateMatrixWorld();
+    const caster = new Raycaster();
+    caster.setFromCamera(at, this.camera);
+    return pick(this.surface.info, this.surface.steps, caster.ray);
+  }
+
+  /** The place in the middle of the picture, or null. */
+  pickMiddle(): Place | null {
+    const box = this.canvas.getBoundingClientRect();
+    return this.pick(box.left + box.width / 2, box.top + box.height / 2);
+  }
+
+  /** Where a place is in the room [mm]; null where nothing was measured. */
+  locate(place: Place): Vector3 | null {
+    return this.surface ? locate(this.surface.info, this.surface.steps, place) : null;
+  }
+
+  /** Where a place is on the picture [CSS px], and whether the surface hides it. */
+  project(place: Place): { x: number; y: number; hidden: boolean } | null {
+    const point = this.locate(place);
+    if (!point || !this.surface) return null;
+    const [ndc, box] = [point.clone().project(this.camera), this.canvas.getBoundingClientRect()];
+    const x = ((ndc.x + 1) / 2) * box.width;
+    const y = ((1 - ndc.y) / 2) * box.height;
+    const outside = Math.abs(ndc.x) > 1 || Math.abs(ndc.y) > 1 || ndc.z > 1;
+    return { x, y, hidden: outside || this.hides(point) };
+  }
+
+  /** Ask for a picture; any number of calls make one. */
+  draw(): void {
+    if (this.asked) return;
+    this.asked = true;
+    requestAnimationFrame((nowMs) => this.paint(nowMs));
+  }
+
+  private paint(nowMs: number): void {
+    this.asked = false;
+    if (this.controls.enableDamping) this.controls.update();
+    this.keepPace(nowMs);
+    const base = this.software ? SOFTWARE : HARDWARE;
+    const detail = this.moving ? { ...base, cellPx: base.cellPx * this.pace } : base;
+    const distance = this.camera.position.distanceTo(this.controls.target);
+    this.camera.near = Math.max(distance / 400, 0.05);
+    this.camera.far = distance + 2e3;
+    this.camera.updateProjectionMatrix();
+    this.camera.updateMatrixWorld();
+    const ratio = this.renderer.getPixelRatio();
+    const triangles = this.surface?.prepare(this.camera, this.canvas.clientHeight * ratio, detail) ?? 0;
+    this.renderer.render(this.scene, this.camera);
+    const { dataset } = this.canvas;
+    dataset['drawn'] = String(Number(dataset['drawn'] ?? 0) + 1);
+    dataset['triangles'] = String(triangles);
+    this.events.drawn();
+  }
+
+  /** While the camera moves, draw as coarsely as it takes to keep up with it. */
+  private keepPace(nowMs: number): void {
+    const frameMs = nowMs - this.lastMs;
+    this.lastMs = nowMs;
+    if (!this.moving || frameMs > 500) return;
+    if (frameMs > SLOW_FRAME_MS) this.pace = Math.min(PACE_MAX, this.pace * 1.25);
+    else if (frameMs < QUICK_FRAME_MS) this.pace = Math.max(1, this.pace / 1.05);
+  }
+
+  private move(moving: boolean): void {
+    this.moving = moving;
+    if (!moving) this.settle();
+  }
+
+  private settle(): void {
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => {
+      this.draw();
+      this.events.settled();
+    }, 250);
+  }
+
+  private hides(point: Vector3): boolean {
+    const caster = new Raycaster();
+    const toPoint = point.clone().sub(this.camera.position);
+    const distance = toPoint.length();
+    caster.set(this.camera.position, toPoint.normalize());
+    const first = pick(this.surface!.info, this.surface!.steps, caster.ray);
+    const met = first && this.locate(first);
+    return met !== null && met.distanceTo(this.camera.position) < distance * 0.985;
+  }
+
+  private resize(): void {
+    const { clientWidth, clientHeight } = this.canvas.parentElement!;
+    this.renderer.setPixelRatio(this.software ? 1 : Math.min(window.devicePixelRatio, 2));
+    this.renderer.setSize(Math.max(1, clientWidth), Math.max(1, clientHeight), false);
+    this.camera.aspect = Math.max(1, clientWidth) / Math.max(1, clientHeight);
+    this.draw();
+  }
+}
+
+function drawsInSoftware(canvas: HTMLCanvasElement): boolean {
+  const probe = document.createElement('canvas').getContext('webgl2');
+  if (!probe) throw new Error(`no WebGL 2 for ${canvas.id}`);
+  const named = probe.getExtension('WEBGL_debug_renderer_info');
+  const name = String(probe.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : probe.RENDERER));
+  probe.getExtension('WEBGL_lose_context')?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}

@@ -1,0 +1,287 @@
+// One scan on the graphics card: range, normals, colour and levels as textures, drawn in tiles.
+
+import {
+  BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, DataTexture, DoubleSide, DynamicDrawUsage, GLSL3, Group,
+  InstancedBufferAttribute, InstancedBufferGeometry, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, NoBlending,
+  NoColorSpace, RedIntegerFormat, RepeatWrapping, RGBAFormat, Scene, ShaderMaterial, UnsignedByteType,
+  UnsignedShortType, Vector2, Vector3, WebGLRenderTarget,
+} from 'three';
+import type { IUniform, PerspectiveCamera, Texture, WebGLRenderer } from 'three';
+import type { Snapshot } from '../link.ts';
+import { RANGE, TEXTURE } from '../protocol/lattice.ts';
+import type { Channel } from '../protocol/lattice.ts';
+import type { ScanInfo } from '../protocol/messages.ts';
+import type { Changed } from '../protocol/model.ts';
+import { NORMALS_FRAGMENT, QUAD_VERTEX, SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
+import { STRIDES, TILE, Tiles } from './tiles.ts';
+import type { Detail } from './tiles.ts';
+
+export const SHADINGS = ['lit', 'relief', 'flat'] as const;
+export type Shading = (typeof SHADINGS)[number];
+const RANGE_BLOCK = 8;
+const TEXTURE_BLOCK = 16;
+/** Differences of a normal reach this far beyond the samples that changed. */
+const NORMAL_REACH = 24;
+
+type Uniforms = Record<string, IUniform>;
+
+export class Surface {
+  readonly object = new Group();
+  readonly steps: Uint16Array;
+  /** How many texels of the scan stand for one here, each way, where the graphics card takes no larger texture. */
+  readonly shrunk: number;
+  private readonly tiles: Tiles;
+  private readonly meshes: Mesh<InstancedBufferGeometry, ShaderMaterial>[];
+  private readonly range: DataTexture;
+  private readonly levels: [range: DataTexture, texture: DataTexture];
+  private readonly coarse: DataTexture;
+  private dense: DataTexture;
+  private readonly normals: WebGLRenderTarget;
+  private readonly normalPass: { scene: Scene; camera: Camera };
+  private readonly uniforms: Uniforms;
+  private overlayed: Channel | null = null;
+
+  constructor(
+    private readonly renderer: WebGLRenderer, readonly info: ScanInfo, snapshot: Omit<Snapshot, 'info'>,
+    private readonly mipmaps: boolean,
+  ) {
+    const { width, height } = info;
+    const most = renderer.capabilities.maxTextureSize;
+    if (width > most || height > most) throw new RangeError(`this graphics card draws at most ${most} columns`);
+    this.shrunk = Math.ceil(Math.max(info.textureWidth, info.textureHeight) / most);
+    this.steps = snapshot.steps;
+    this.range = integers(this.steps, width, height, 'R16UI');
+    this.levels = [
+      integers(snapshot.levels[0], Math.ceil(width / RANGE_BLOCK), Math.ceil(height / RANGE_BLOCK), 'R8UI'),
+      integers(snapshot.levels[1], Math.ceil(info.textureWidth / TEXTURE_BLOCK), Math.ceil(info.textureHeight / TEXTURE_BLOCK), 'R8UI'),
+    ];
+    this.coarse = colours(snapshot.coarseTexels, info.coarseTextureWidth, info.coarseTextureHeight);
+    this.dense = colours(new Uint8Array(4), 1, 1);
+    this.normals = new WebGLRenderTarget(width, height, {
+      depthBuffer: false, wrapS: RepeatWrapping, wrapT: ClampToEdgeWrapping, minFilter: LinearFilter, magFilter: LinearFilter,
+      generateMipmaps: false,
+    });
+    this.uniforms = {
+      uRange: { value: this.range }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
+      uPitchMm: { value: info.pitchMm }, uZMaxMm: { value: info.zMaxMm }, uTheta0: { value: info.theta0Rad },
+      uTile: { value: TILE }, uNormals: { value: this.normals.texture }, uCoarse: { value: this.coarse },
+      uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
+      uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
+    };
+    this.meshes = STRIDES.map((stride) => tileMesh(stride, this.uniforms));
+    this.object.add(...this.meshes);
+    this.normalPass = quadPass(this.uniforms, this.levels[0]);
+    this.tiles = new Tiles(info);
+    this.tiles.update(this.steps, snapshot.levels[0]);
+    this.drawNormals({ x: 0, y: 0, width, height });
+  }
+
+  /** Take rectangles that have changed, and the levels then held. */
+  patch(channel: Channel, changed: Changed[], level: Uint8Array): void {
+    const levels = this.levels[channel];
+    (levels.image.data as Uint8Array).set(level);
+    levels.needsUpdate = true;
+    if (channel === RANGE) this.patchRange(changed, level);
+    else this.patchTexels(changed);
+  }
+
+  /** Show another picture of the same shape, as while a sweep runs. */
+  replace(steps: Uint16Array, coarseTexels: Uint8Array): void {
+    this.steps.set(steps);
+    (this.coarse.image.data as Uint8Array).set(coarseTexels);
+    this.range.needsUpdate = this.coarse.needsUpdate = true;
+    this.tiles.update(this.steps, this.levels[0].image.data as Uint8Array);
+    this.drawNormals({ x: 0, y: 0, width: this.info.width, height: this.info.height });
+  }
+
+  /** How to shade, and whose spacing to lay over it. */
+  show(shading: Shading, overlay: Channel | null): void {
+    this.overlayed = overlay;
+    const levels = this.levels[overlay ?? RANGE];
+    this.uniforms['uMode']!.value = SHADINGS.indexOf(shading);
+    this.uniforms['uOverlay']!.value = overlay === null ? 0 : 0.62;
+    this.uniforms['uLevel']!.value = levels;
+    const { width, height, textureWidth, textureHeight } = this.info;
+    const scale = overlay === TEXTURE ? [textureWidth / TEXTURE_BLOCK, textureHeight / TEXTURE_BLOCK] : [width / RANGE_BLOCK, height / RANGE_BLOCK];
+    (this.uniforms['uLevelScale']!.value as Vector2).set(scale[0]!, scale[1]!);
+  }
+
+  /** Choose tiles for a camera and light them from it. Returns the triangles to be drawn. */
+  prepare(camera: PerspectiveCamera, sidePx: number, detail: Detail): number {
+    const { batches, triangles } = this.tiles.choose(camera, sidePx, detail);
+    this.meshes.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.corners, batches[index]!.edges));
+    (this.uniforms['uKey']!.value as Vector3).set(-0.45, 0.55, 0.8).normalize().transformDirection(camera.matrixWorld);
+    (this.uniforms['uFill']!.value as Vector3).set(0.8, 0.05, 0.45).normalize().transformDirection(camera.matrixWorld);
+    return triangles;
+  }
+
+  /** Which overlay is on. */
+  get overlay(): Channel | null {
+    return this.overlayed;
+  }
+
+  dispose(): void {
+    for (const texture of [this.range, ...this.levels, this.coarse, this.dense]) texture.dispose();
+    this.normals.dispose();
+    for (const { geometry, material } of this.meshes) {
+      geometry.dispose();
+      material.dispose();
+    }
+  }
+
+  private patchRange(changed: Changed[], level: Uint8Array): void {
+    for (const { x, y, width, height, cells } of changed) {
+      for (let row = 0; row < height; row++) {
+        this.steps.set((cells as Uint16Array).subarray(row * width, (row + 1) * width), (y + row) * this.info.width + x);
+      }
+      this.upload(integers(cells as Uint16Array, width, height, 'R16UI'), this.range, x, y);
+      this.drawNormals({ x, y, width, height });
+    }
+    this.tiles.update(this.steps, level);
+  }
+
+  private patchTexels(changed: Changed[]): void {
+    if (this.dense.image.width === 1) this.makeDense();
+    changed.forEach(({ x, y, width, height, cells }, index) => {
+      const last = index === changed.length - 1;
+      this.dense.generateMipmaps = this.mipmaps && last;
+      const smaller = shrink(cells as Uint8Array, x, y, width, height, this.shrunk);
+      if (smaller.width && smaller.height) this.upload(colours(smaller.cells, smaller.width, smaller.height), this.dense, smaller.x, smaller.y);
+    });
+  }
+
+  /** The refined colour's texture, transparent; it takes memory only once something is refined. */
+  private makeDense(): void {
+    this.dense.dispose();
+    const [width, height] = [Math.floor(this.info.textureWidth / this.shrunk), Math.floor(this.info.textureHeight / this.shrunk)];
+    this.dense = colours(null, width, height);
+    this.dense.source.dataReady = false; // nothing to send: the card clears it
+    this.dense.minFilter = this.mipmaps ? LinearMipmapLinearFilter : LinearFilter;
+    this.dense.anisotropy = this.mipmaps ? Math.min(4, this.renderer.capabilities.getMaxAnisotropy()) : 1;
+    this.dense.generateMipmaps = this.mipmaps;
+    this.uniforms['uDense']!.value = this.dense;
+  }
+
+  private upload(source: DataTexture, target: Texture, x: number, y: number): void {
+    this.renderer.copyTextureToTexture(source, target, null, new Vector2(x, y));
+    source.dispose();
+  }
+
+  private drawNormals({ x, y, width, height }: Omit<Changed, 'cells'>): void {
+    const all = { left: Math.max(0, x - NORMAL_REACH), right: Math.min(this.info.width, x + width + NORMAL_REACH) };
+    const top = Math.max(0, y - NORMAL_REACH);
+    const bottom = Math.min(this.info.height, y + height + NORMAL_REACH);
+    const strips = [[all.left, all.right]];
+    if (x < NORMAL_REACH) strips.push([Math.max(0, this.info.width + x - NORMAL_REACH), this.info.width]);
+    if (x + width + NORMAL_REACH > this.info.width) strips.push([0, Math.min(this.info.width, x + width + NORMAL_REACH - this.info.width)]);
+    const before = this.renderer.getRenderTarget();
+    this.normals.scissorTest = true;
+    for (const [left, right] of strips) {
+      this.normals.scissor.set(left!, top, right! - left!, bottom - top);
+      this.renderer.setRenderTarget(this.normals);
+      this.renderer.render(this.normalPass.scene, this.normalPass.camera);
+    }
+    this.renderer.setRenderTarget(before);
+  }
+}
+
+function integers(data: Uint8Array | Uint16Array, width: number, height: number, format: 'R8UI' | 'R16UI'): DataTexture {
+  const type = format === 'R8UI' ? UnsignedByteType : UnsignedShortType;
+  const texture = new DataTexture(data as Uint16Array<ArrayBuffer>, width, height, RedIntegerFormat, type);
+  texture.internalFormat = format;
+  texture.minFilter = texture.magFilter = NearestFilter;
+  texture.unpackAlignment = format === 'R8UI' ? 1 : 2;
+  texture.colorSpace = NoColorSpace;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+function colours(data: Uint8Array | null, width: number, height: number): DataTexture {
+  const texture = new DataTexture(data as Uint8Array<ArrayBuffer> | null, width, height, RGBAFormat, UnsignedByteType);
+  texture.minFilter = texture.magFilter = LinearFilter;
+  texture.wrapS = RepeatWrapping;
+  texture.wrapT = ClampToEdgeWrapping;
+  texture.colorSpace = NoColorSpace;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+/** Every `by`-th texel of a rectangle, where a texture of full size does not fit. */
+function shrink(cells: Uint8Array, x: number, y: number, width: number, height: number, by: number) {
+  if (by === 1) return { cells, x, y, width, height };
+  const [left, top] = [Math.ceil(x / by), Math.ceil(y / by)];
+  const [right, bottom] = [Math.floor((x + width - 1) / by), Math.floor((y + height - 1) / by)];
+  const small = new Uint8Array(4 * Math.max(0, right - left + 1) * Math.max(0, bottom - top + 1));
+  let at = 0;
+  for (let row = top; row <= bottom; row++) {
+    for (let column = left; column <= right; column++, at += 4) {
+      const from = 4 * ((row * by - y) * width + column * by - x);
+      small.set(cells.subarray(from, from + 4), at);
+    }
+  }
+  return { cells: small, x: left, y: top, width: right - left + 1, height: bottom - top + 1 };
+}
+
+function tileMesh(stride: number, shared: Uniforms): Mesh<InstancedBufferGeometry, ShaderMaterial> {
+  const geometry = new InstancedBufferGeometry();
+  const { position, index } = tileGrid(TILE / stride);
+  geometry.setAttribute('position', position);
+  geometry.setIndex(index);
+  geometry.instanceCount = 0;
+  const material = new ShaderMaterial({
+    vertexShader: SURFACE_VERTEX, fragmentShader: SURFACE_FRAGMENT, glslVersion: GLSL3, side: DoubleSide, blending: NoBlending,
+    uniforms: { ...shared, uStride: { value: stride } },
+  });
+  const mesh = new Mesh(geometry, material);
+  mesh.frustumCulled = false;
+  return mesh;
+}
+
+function tileGrid(cells: number): { position: BufferAttribute; index: BufferAttribute } {
+  const side = cells + 1;
+  const position = new Float32Array(3 * side * side);
+  const index = new Uint16Array(6 * cells * cells);
+  for (let y = 0, at = 0; y < side; y++) for (let x = 0; x < side; x++, at += 3) position.set([x, y, 0], at);
+  for (let y = 0, at = 0; y < cells; y++) {
+    for (let x = 0; x < cells; x++, at += 6) {
+      const a = y * side + x;
+      index.set([a, a + side, a + 1, a + 1, a + side, a + side + 1], at);
+    }
+  }
+  return { position: new BufferAttribute(position, 3), index: new BufferAttribute(index, 1) };
+}
+
+function fill(geometry: InstancedBufferGeometry, corners: number[], edges: number[]): void {
+  const count = corners.length / 2;
+  geometry.instanceCount = count;
+  if (!count) return;
+  const room = (geometry.getAttribute('tile') as BufferAttribute | undefined)?.count ?? 0;
+  if (room < count) {
+    const size = Math.max(count, 2 * room, 16);
+    for (const [name, each] of [['tile', 2], ['edges', 4]] as const) {
+      const attribute = new InstancedBufferAttribute(new Float32Array(size * each), each);
+      attribute.setUsage(DynamicDrawUsage);
+      geometry.setAttribute(name, attribute);
+    }
+  }
+  for (const [name, values] of [['tile', corners], ['edges', edges]] as const) {
+    const attribute = geometry.getAttribute(name) as InstancedBufferAttribute;
+    (attribute.array as Float32Array).set(values);
+    attribute.needsUpdate = true;
+  }
+}
+
+function quadPass(shared: Uniforms, level: DataTexture): { scene: Scene; camera: Camera } {
+  const geometry = new BufferGeometry();
+  geometry.setAttribute('position', new BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
+  const material = new ShaderMaterial({
+    vertexShader: QUAD_VERTEX, fragmentShader: NORMALS_FRAGMENT, glslVersion: GLSL3, blending: NoBlending, depthTest: false,
+    depthWrite: false, uniforms: { ...shared, uLevel: { value: level } },
+  });
+  const quad = new Mesh(geometry, material);
+  quad.frustumCulled = false;
+  const scene = new Scene();
+  scene.add(quad);
+  return { scene, camera: new Camera() };
+}
+

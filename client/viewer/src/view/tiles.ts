@@ -1,0 +1,123 @@
+// Level of detail: the grid in tiles of 64 x 64 samples, each drawn with every 1st, 2nd, 4th ... sample.
+
+import type { PerspectiveCamera } from 'three';
+import { Frustum, Matrix4, Sphere, Vector3 } from 'three';
+import type { ScanInfo } from '../protocol/messages.ts';
+import { pointAt } from './framing.ts';
+
+export const TILE = 64;
+export const STRIDES = [1, 2, 4, 8, 16, 32] as const;
+const BLOCK = 8;
+
+/** How fine to draw: side of a drawn cell on the screen, and most triangles of a frame. */
+export interface Detail {
+  cellPx: number;
+  trianglesMax: number;
+}
+
+interface Tile {
+  column: number;
+  row: number;
+  centre: Vector3;
+  reachMm: number;
+  /** Finest stride that shows more than the samples held. */
+  finest: number;
+}
+
+/** Instances of one stride: tile corners, and strides of the four neighbours. */
+export interface Batch {
+  corners: number[];
+  edges: number[];
+}
+
+export class Tiles {
+  private readonly tiles: Tile[] = [];
+  private readonly across: number;
+  private readonly down: number;
+  private readonly stride: Int32Array;
+  private readonly frustum = new Frustum();
+
+  constructor(private readonly info: ScanInfo) {
+    this.across = Math.ceil(info.width / TILE);
+    this.down = Math.ceil(info.height / TILE);
+    this.stride = new Int32Array(this.across * this.down);
+    for (let row = 0; row < this.down; row++) {
+      for (let column = 0; column < this.across; column++) {
+        this.tiles.push({ column: column * TILE, row: row * TILE, centre: new Vector3(), reachMm: 0, finest: 1 });
+      }
+    }
+  }
+
+  /** Look again where tiles lie and what they hold. level: of 8 x 8 blocks. */
+  update(steps: Uint16Array, level: Uint8Array): void {
+    const { width, height, stepMm, pitchMm, zMaxMm, theta0Rad } = this.info;
+    for (const tile of this.tiles) {
+      const [columns, rows] = [Math.min(TILE, width - tile.column), Math.min(TILE, height - tile.row)];
+      let [least, most] = [Infinity, 0];
+      for (let y = 0; y < rows; y += 4) {
+        for (let x = 0; x < columns; x += 4) {
+          const value = steps[(tile.row + y) * width + tile.column + x]!;
+          if (value) [least, most] = [Math.min(least, value), Math.max(most, value)];
+        }
+      }
+      const radius = (most ? (least + most) / 2 : 0) * stepMm;
+      const angle = theta0Rad + (2 * Math.PI * (tile.column + columns / 2)) / width;
+      tile.centre.copy(pointAt(radius, angle, zMaxMm - (tile.row + rows / 2) * pitchMm));
+      const half = [(radius * Math.PI * columns) / width, (rows * pitchMm) / 2, most ? ((most - least) * stepMm) / 2 : 0];
+      tile.reachMm = most ? 1.3 * Math.hypot(...half) : 0;
+      tile.finest = this.finest(tile, columns, rows, level);
+    }
+  }
+
+  /** Batches by stride index, and the triangles in them. sidePx: height of the picture. */
+  choose(camera: PerspectiveCamera, sidePx: number, detail: Detail): { batches: Batch[]; triangles: number } {
+    this.frustum.setFromProjectionMatrix(new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
+    const focalPx = sidePx / (2 * Math.tan((camera.fov * Math.PI) / 360));
+    for (let cellPx = detail.cellPx; ; cellPx *= 1.5) {
+      const triangles = this.pick(camera, focalPx, cellPx);
+      if (triangles <= detail.trianglesMax || cellPx > 64 * detail.cellPx) return { batches: this.batches(), triangles };
+    }
+  }
+
+  private pick(camera: PerspectiveCamera, focalPx: number, cellPx: number): number {
+    let triangles = 0;
+    const ball = new Sphere();
+    this.tiles.forEach((tile, index) => {
+      const seen = tile.reachMm > 0 && this.frustum.intersectsSphere(ball.set(tile.centre, tile.reachMm));
+      const distance = Math.max(camera.position.distanceTo(tile.centre) - tile.reachMm, camera.near);
+      const samplePx = (this.info.pitchMm * focalPx) / distance;
+      const wanted = Math.max(cellPx / samplePx, tile.finest);
+      const stride = Math.min(2 ** Math.max(0, Math.floor(Math.log2(wanted))), STRIDES.at(-1)!);
+      this.stride[index] = seen ? stride : 0;
+      triangles += seen ? 2 * (TILE / stride) ** 2 : 0;
+    });
+    return triangles;
+  }
+
+  private batches(): Batch[] {
+    const batches: Batch[] = STRIDES.map(() => ({ corners: [], edges: [] }));
+    this.tiles.forEach((tile, index) => {
+      const stride = this.stride[index]!;
+      if (!stride) return;
+      const [x, y] = [index % this.across, Math.floor(index / this.across)];
+      const beside = (dx: number, dy: number): number => {
+        const row = y + dy;
+        if (row < 0 || row >= this.down) return stride;
+        return Math.max(stride, this.stride[row * this.across + ((x + dx + this.across) % this.across)]!);
+      };
+      const batch = batches[Math.log2(stride)]!;
+      batch.corners.push(tile.column, tile.row);
+      batch.edges.push(beside(-1, 0), beside(1, 0), beside(0, -1), beside(0, 1));
+    });
+    return batches;
+  }
+
+  private finest(tile: Tile, columns: number, rows: number, level: Uint8Array): number {
+    const across = Math.ceil(this.info.width / BLOCK);
+    let least = Infinity;
+    for (let y = tile.row / BLOCK; y < (tile.row + rows) / BLOCK; y++) {
+      for (let x = tile.column / BLOCK; x < (tile.column + columns) / BLOCK; x++) least = Math.min(least, level[y * across + x]!);
+    }
+    return Math.max(1, 2 ** Math.floor(least / 2 - 1));
+  }
+}
