@@ -188,7 +188,7 @@ def test_frames_dumped_in_the_protocol_are_sound() -> None:
         frame = reader.next_event()
         assert isinstance(frame, Frame)
         messages.append(decode_message(frame.type, frame.payload))
-    assert [type(message) for message in messages] == [Hello, Ack]
+    assert messages == [Hello(payload_max=1024, window_bytes=65536), Ack(1)]
 
 
 def test_live_columns_dumped_in_the_protocol_are_what_the_page_says() -> None:
