@@ -61,7 +61,8 @@ class Sweep:
         if not self._pieces and (self._again or self._waiting):
             exposure = (self._again or self._waiting).popleft()
             key = (exposure.channel, exposure.pass_index, exposure.column)
-            self._is_first_time = key not in self._sent
+            is_too_far = exposure.pass_index >= len(self.header.columns_in(exposure.channel))  # the table overshot
+            self._is_first_time = key not in self._sent and not is_too_far
             self._sent.add(key)
             self._pieces.extend(self._cut(exposure))
         return self._pieces[0] if self._pieces else None
@@ -84,11 +85,8 @@ class Sweep:
             self._waiting.extend(sorted(self._held.values(), key=_coarseness))
 
     def _keep(self, exposure: Exposure) -> None:
-        """Remember what was seen, unless the table passes there once more without being asked to."""
+        """Remember what was seen."""
         key = (exposure.channel, exposure.pass_index, exposure.column)
-        if key in self._exposed:
-            self._waiting.extend([] if self._is_buffered else [exposure])
-            return
         if not self._is_buffered:
             self._waiting.append(exposure)
         self._exposed.add(key)

@@ -182,8 +182,9 @@ class Turntable:
     def _plan(self, channels: Channel, passes: int, overlap: int, stride: int) -> _Schedule:
         spec = self.specimen.grid.spec
         widths = {Channel.RANGE: spec.width, Channel.TEXTURE: spec.texture_width}
+        beyond = self._flaws.overshoot_turns
         parts = [
-            self._plan_channel(channel, width, _places(width, passes, overlap, stride, self._flaws.overshoot_turns))
+            self._plan_channel(channel, width, passes, _places(width, passes, overlap, stride, beyond))
             for channel, width in widths.items()
             if channel in channels
         ]
@@ -191,12 +192,16 @@ class Turntable:
         table = table[np.argsort(table[:, 0], kind="stable")]
         return _Schedule(*(np.ascontiguousarray(part) for part in table.T))
 
-    def _plan_channel(self, channel: Channel, width: int, places: tuple[IntArray, IntArray]) -> IntArray:
+    def _plan_channel(
+        self, channel: Channel, width: int, passes_named: int, places: tuple[IntArray, IntArray]
+    ) -> IntArray:
         """(n, 4) count, channel, pass, column of one camera's triggers."""
         index, passes = places
         spacing = self.counts_per_turn // width
         counts = (2 * index + 1) * (spacing // 2) + self._jitter(len(index), spacing)
-        columns = index % width if self._sense > 0 else width - 1 - index % width
+        columns = index % width
+        if self._sense < 0:  # those of the overlap are named in the order in which they come
+            columns = np.where(passes < passes_named, width - 1 - columns, columns)
         return np.stack([counts, np.full_like(index, channel), passes, columns], axis=1)
 
     def _jitter(self, n: int, spacing: int) -> NDArray[np.int64]:
@@ -215,5 +220,5 @@ def _places(width: int, passes: int, overlap: int, stride: int, overshoot: float
     end = width * (len(first) + len(later))
     beyond = end + turn[: width * overlap // OVERLAP_TURN]
     too_far = beyond.size + end + turn[: int(overshoot * width)]
-    parts = [*((0, part) for part in first), *enumerate(later, 1), (passes, beyond), (max(passes - 1, 0), too_far)]
+    parts = [*((0, part) for part in first), *enumerate(later, 1), (passes, beyond), (passes + 1, too_far)]
     return np.concatenate([part for _, part in parts]), np.concatenate([np.full_like(part, p) for p, part in parts])

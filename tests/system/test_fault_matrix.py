@@ -1,0 +1,147 @@
+"""Every fault on every carrier: a scan as without it, or one whose report tells, or a cut sweep on disk. Seeded."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.serial_port import SerialPort
+from node.scan_quality import ScanQuality
+from protocol.errors import PortLost
+from protocol.scanner_messages import Channel, Order, SweepRequest
+from tests.system.fault_rig import REQUEST, Bench, Capturing, Ending, Line, bumpy, memory, pty
+
+Carrier = Callable[[Bench], AbstractContextManager[Line]]
+CARRIERS = {"memory": memory, "pty": pty}
+
+REPAIRED = [
+    "", "loss=0.03", "flip=0.03", "burst=0.05", "truncate=0.03", "lie=0.03", "twice=0.2", "reorder=0.1", "dribble",
+    "stall=0.1", "unplug=0.2", "minor", "reversed", "overshoot=0.1", "loss=0.01,unplug=0.2",
+    "loss=0.02,flip=0.02,burst=0.02,twice=0.1,reorder=0.1", "reversed,flip=0.02,overshoot=0.2",
+]  # fmt: skip
+CUT = ["stall=4", "stall=30", "reset", "loss=0.02,reset"]
+REPORTED = {
+    "slip=0.05": lambda q: q.has_slipped and abs(q.slip_deg - 18) < 2,
+    "slip=0.02": lambda q: q.has_slipped and abs(q.slip_deg - 7.2) < 2,
+    "ticks=3000": lambda q: q.has_slipped,
+    "dead=3": lambda q: q.dead_rows == 3,
+    "saturated=4": lambda q: q.saturated_columns >= 1,
+    "spikes=0.002": lambda q: q.spikes > 5 and q.filled > 5,
+    "dropouts=0.002": lambda q: q.filled > 5,
+    "noise=10": lambda q: q.noise_mm is not None and 0.07 < q.noise_mm < 0.13,
+    "spikes=0.001,loss=0.02,slip=0.04": lambda q: q.spikes > 2 and q.has_slipped,
+}  # fmt: skip
+JITTER_COUNTS = 60
+
+
+@pytest.fixture(params=CARRIERS)
+def carrier(request: pytest.FixtureRequest) -> Carrier:
+    return CARRIERS[request.param]
+
+
+def swept(carrier: Carrier, bench: Bench, request: SweepRequest = REQUEST) -> Ending:
+    with carrier(bench) as line:
+        return Capturing(line, bench.folder, request).run()
+
+
+@pytest.mark.parametrize("faults", REPAIRED)
+def test_what_the_link_can_repair_leaves_no_trace(carrier: Carrier, faults: str, tmp_path: Path) -> None:
+    bench = Bench(faults, 1, tmp_path)
+    ending = swept(carrier, bench)
+    assert ending.kind == "scan", ending.why
+    assert ending.equals(bench.specimen.grid) and not ending.kept
+    assert ending.assembly is not None and ending.assembly.quality.complaints == ()
+
+
+@pytest.mark.parametrize("faults", CUT)
+def test_what_ends_a_sweep_leaves_it_on_disk_as_interrupted(carrier: Carrier, faults: str, tmp_path: Path) -> None:
+    if carrier is pty and faults == "stall=30":
+        pytest.skip("30 s in real time; the line in memory does it")
+    ending = swept(carrier, Bench(faults, 2, tmp_path))
+    assert ending.kind == "interrupted" and ending.assembly is None
+    (sweep,) = ending.kept
+    assert 0 < sweep.held < sweep.expected and not sweep.is_complete
+
+
+@pytest.mark.parametrize("faults", REPORTED)
+def test_what_cannot_be_repaired_is_reported(carrier: Carrier, faults: str, tmp_path: Path) -> None:
+    tells: Callable[[ScanQuality], bool] = REPORTED[faults]
+    ending = swept(carrier, Bench(faults, 3, tmp_path))
+    assert ending.kind == "scan", ending.why
+    assert ending.assembly is not None and tells(ending.assembly.quality), ending.assembly
+    assert ending.assembly.quality.complaints or ending.assembly.quality.noise_mm
+
+
+def test_a_jittering_encoder_blurs_little(carrier: Carrier, tmp_path: Path) -> None:
+    bench = Bench("", 4, tmp_path, jitter_counts=JITTER_COUNTS)
+    ending = swept(carrier, bench)
+    assert ending.assembly is not None
+    grid, truth = ending.assembly.grid, bench.specimen.grid
+    assert np.abs(grid.range_steps.astype(int) - truth.range_steps).max() <= 3
+    assert np.abs(grid.texture.astype(int) - truth.texture).max() <= 8
+
+
+def test_a_device_of_another_major_version_is_refused_by_name(carrier: Carrier, tmp_path: Path) -> None:
+    ending = swept(carrier, Bench("major", 5, tmp_path))
+    assert ending.kind == "refused" and "speaks link version 2, this node 1.1" in ending.why and not ending.kept
+
+
+def test_two_scanners_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
+    endings: dict[str, Ending] = {}
+
+    def sweep(name: str) -> None:
+        folder = tmp_path / name
+        folder.mkdir()
+        endings[name] = swept(pty, Bench("loss=0.01", 6, folder, serial_number=name))
+
+    threads = [threading.Thread(target=sweep, args=(name,)) for name in ("ONE", "TWO")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert {name: ending.equals(bumpy().grid) for name, ending in endings.items()} == {"ONE": True, "TWO": True}
+
+
+def test_one_port_opened_twice_is_refused_the_second_time(tmp_path: Path) -> None:
+    with pty(Bench("", 7, tmp_path)) as line:
+        first = line.open_port()
+        with pytest.raises(PortLost, match="cannot open"):
+            SerialPort(first.name)
+        first.close()
+
+
+@pytest.mark.parametrize("faults", ["", "loss=0.02", "unplug=0.2"])
+def test_a_buffered_scanner_sends_coarse_to_fine_and_makes_the_same_scan(faults: str, tmp_path: Path) -> None:
+    bench = Bench(faults, 8, tmp_path, order=Order.BUFFERED)
+    ending = swept(memory, bench)
+    assert ending.equals(bench.specimen.grid), ending.why
+
+
+def test_columns_that_a_buffered_scanner_could_not_hold_cut_the_sweep(tmp_path: Path) -> None:
+    ending = swept(memory, Bench("", 9, tmp_path, order=Order.BUFFERED, retention_columns=50))
+    assert ending.kind == "interrupted" and "holds them no longer" in ending.why and len(ending.kept) == 1
+
+
+@pytest.mark.parametrize("faults", ["", "flip=0.02", "unplug=0.2"])
+@pytest.mark.parametrize("request_", [SweepRequest(stride=8), SweepRequest(passes=3, stride=4), SweepRequest(passes=4)])
+def test_fast_first_passes_and_several_passes_make_the_same_scan(
+    faults: str, request_: SweepRequest, tmp_path: Path
+) -> None:
+    bench = Bench(faults, 10, tmp_path)
+    ending = swept(memory, bench, request_)
+    assert ending.equals(bench.specimen.grid), ending.why
+    assert ending.assembly is not None and ending.assembly.quality.passes >= request_.passes
+
+
+def test_a_fast_first_turn_shows_the_whole_object_early(tmp_path: Path) -> None:
+    with memory(Bench("", 11, tmp_path)) as line:
+        capturing = Capturing(line, tmp_path, SweepRequest(stride=8))
+        capturing.run()
+    width = bumpy().grid.spec.width
+    seen = [c.column for c in capturing._held if c.CHANNEL is Channel.RANGE and c.row0 == 0]
+    assert seen[: width // 8] == list(range(0, width, 8))
