@@ -24,6 +24,7 @@ from node.refine_range import (
     choose_range,
     code_range,
     expected_range_bytes,
+    mend_range,
     note_range,
     select_range,
 )
@@ -32,8 +33,9 @@ from node.refine_texture import (
     SPACINGS,
     choose_spacing,
     code_texture,
-    coded_mse,
+    coded_error,
     db_of_mse,
+    held_error,
     mse_of_db,
     quality_bounds,
     select_texture,
@@ -241,12 +243,19 @@ class _Planner:
             if coded is None:
                 return False
             if search.fits(coded):
-                mse = coded_mse(self._scan, coded, self._texture_region)
-                search.measured(Point(quality, mse, coded))
+                search.measured(Point(quality, self._texture_error(coded), coded))
             else:
                 search.too_large(quality, coded.wire_bytes)
             self._learn(p, quality, coded)
         return True
+
+    def _texture_error(self, coded: Coded) -> float:
+        """Squared error per value that a refinement leaves in the window, what is held there counted as expected."""
+        total, count = coded_error(self._scan, coded, self._texture_region)
+        if self._model is not None:
+            held_total, held_count = held_error(self._state, coded, self._texture_region, self._model)
+            total, count = total + held_total, count + held_count
+        return total / max(count, 1)
 
     def _learn(self, p: float, quality: int, coded: Coded) -> None:
         if self._model is not None and p == 1:
@@ -258,7 +267,11 @@ class _Planner:
     def _fill_range(self, wanted: RangeParameters, limit_bytes: float) -> Coded | None:
         """Range as wanted; where the limit binds, with the smallest quantum that fits it."""
         if not (self._limited and math.isfinite(limit_bytes)):
-            return self._first_that_fits(wanted, limit_bytes)
+            self._count_encode()
+            coded = mend_range(self._scan, self._state, self._range_region, wanted, self._target_steps)
+            if coded is None or coded.wire_bytes <= limit_bytes:
+                return coded
+            self._limited = True
         wanted = self._affordable(wanted, limit_bytes)
         coded = self._first_that_fits(wanted, limit_bytes)
         if coded is None or coded.quality == 1 or coded.wire_bytes >= FILL * limit_bytes:
@@ -332,7 +345,7 @@ class _Planner:
             return
         self._left -= coded.wire_bytes
         if coded.channel is Channel.RANGE:
-            note_range(self._scan, self._state, coded)
+            note_range(self._scan, self._state, coded, self._target_steps)
         else:
             coded.note(self._state)
         self._coded.append(coded)

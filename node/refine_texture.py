@@ -11,8 +11,9 @@ from node.coded import Coded, rho_of
 from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
+from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
-from protocol.grid import BoolArray, ImageArray
+from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray
 from protocol.holdings import ChannelHoldings, texture_rank
 from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice
 from protocol.messages import CodecName, TextureParameters
@@ -38,7 +39,8 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
         selection = _whole(shape, region, p)
         if selection is None:
             continue
-        if region_mse(scan, selection, region, texture_samples(scan, selection)) <= allowed:
+        total, count = adopted_error(scan, selection, region, texture_samples(scan, selection))
+        if total <= allowed * count:
             return p
     return 1
 
@@ -92,16 +94,17 @@ def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:
     return Parameters(round(2 * wanted.p), *region.blocks(16), rho, rho)
 
 
-def coded_mse(scan: Scan, coded: Coded, region: Region) -> float:
-    """Squared error per value that a refinement leaves in the part of the region it adopts."""
+def coded_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, int]:
+    """Squared error that a refinement leaves in the part of the region it adopts, and of how many values."""
     shape = coded.selection.sample_shape
     texels = decode_texture(coded.payload, TextureCodec(coded.codec), coded.quality, shape)
-    return region_mse(scan, coded.selection, region, texels)
+    return adopted_error(scan, coded.selection, region, texels)
 
 
-def region_mse(scan: Scan, selection: Selection, region: Region, texels: ImageArray) -> float:
-    """Squared error per value over the region's texels inside the selection, from its (decoded) samples."""
+def adopted_error(scan: Scan, selection: Selection, region: Region, texels: ImageArray) -> tuple[float, int]:
+    """Squared error over a region's adopted texels, from a selection's (decoded) samples, and of how many values."""
     patch = texture_patch(selection, texels)
+    adopted = selection.adopted_cells().view(np.uint8)
     total, count = 0.0, 0
     for rows, columns, source in selection.spans():
         for inside in _overlaps(region, columns):
@@ -109,11 +112,24 @@ def region_mse(scan: Scan, selection: Selection, region: Region, texels: ImageAr
             if top >= bottom:
                 continue
             offset = source.start - columns.start
-            made = patch[top - rows.start : bottom - rows.start, inside.start + offset : inside.stop + offset]
-            truth = np.ascontiguousarray(scan.texture[top:bottom, inside])
-            total += cv2.norm(np.ascontiguousarray(made), truth, cv2.NORM_L2SQR)
-            count += made.size
-    return total / count if count else 0.0
+            place = slice(top - rows.start, bottom - rows.start), slice(inside.start + offset, inside.stop + offset)
+            made, mask = np.ascontiguousarray(patch[place]), np.ascontiguousarray(adopted[place])
+            total += cv2.norm(made, np.ascontiguousarray(scan.texture[top:bottom, inside]), cv2.NORM_L2SQR, mask)
+            count += 3 * cv2.countNonZero(mask)
+    return total, count
+
+
+def held_error(state: ClientState, coded: Coded, region: Region, model: TextureModel) -> tuple[float, int]:
+    """Squared error expected in the blocks of a region that a refinement leaves as they are, and of how many values."""
+    kept = np.ones(state.shapes[Channel.TEXTURE].blocks, np.bool_)
+    kept.ravel()[coded.selection.adopted_blocks()] = False
+    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
+    columns = np.arange(left, left + wide) % kept.shape[1]
+    rows, across = np.nonzero(kept[top : top + high][:, columns])
+    rank = state.holdings.channels[Channel.TEXTURE].rank[rows + top, columns[across]]
+    values = 3 * TEXTURE_BLOCK * TEXTURE_BLOCK
+    mse = model.mse_at(rows + top, columns[across], rank.astype(np.int64) - 1)
+    return float(values * mse.sum()), values * rows.size
 
 
 def mse_of_db(db: float) -> float:

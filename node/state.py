@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from node.library import Scan
 from protocol.grid import RANGE_BLOCK, VOID, IntArray, StepArray
@@ -18,15 +20,25 @@ class ClientState:
     """One client's model of one scan, as the node believes it to be.
 
     error : (blocks_y, blocks_x) uint16 largest range error left in each block. [steps]
+    beyond : likewise uint8, how many of its cells are further off than target_steps, likewise float32.
     """
 
     shapes: dict[Channel, ChannelShape]
     holdings: Holdings
     error: StepArray
+    beyond: NDArray[np.uint8]
+    target_steps: NDArray[np.float32]
 
     def copy(self) -> ClientState:
         """An independent copy, to plan on."""
-        return ClientState(self.shapes, self.holdings.copy(), self.error.copy())
+        arrays = self.error.copy(), self.beyond.copy(), self.target_steps.copy()
+        return ClientState(self.shapes, self.holdings.copy(), *arrays)
+
+    def cells_beyond(self, target_steps: float) -> IntArray:
+        """At most how many cells of each block are further off than target_steps. (blocks_y, blocks_x) int64"""
+        known = (self.target_steps <= target_steps) | (self.error <= target_steps)
+        counted = np.where(self.error <= target_steps, 0, self.beyond)
+        return np.where(known, counted, RANGE_BLOCK * RANGE_BLOCK).astype(np.int64)
 
 
 def scan_shapes(scan: Scan) -> dict[Channel, ChannelShape]:
@@ -39,15 +51,23 @@ def first_state(scan: Scan, coarse_steps: StepArray) -> ClientState:
     """The state of a client that has the first view of a scan and nothing else; coarse_steps as it was sent."""
     shapes = scan_shapes(scan)
     dense = coarse_to_range(coarse_steps, shapes[Channel.RANGE])
-    return ClientState(shapes, Holdings.coarse(shapes), block_errors(dense, scan.range_steps))
+    error, beyond = block_errors(dense, scan.range_steps, math.inf)
+    target = np.full(error.shape, np.inf, np.float32)  # so that nothing counts as good enough
+    return ClientState(shapes, Holdings.coarse(shapes), error, beyond, target)
 
 
-def block_errors(patch: StepArray, truth: StepArray) -> StepArray:
-    """Largest |patch - truth| in each 8x8 block that is measured in truth. (rows, columns) uint16 [steps]"""
+def block_errors(patch: StepArray, truth: StepArray, target_steps: float) -> tuple[StepArray, NDArray[np.uint8]]:
+    """Of each 8x8 block measured in truth: the largest |patch - truth|, and how many cells are further off than target.
+
+    Returns (rows, columns) uint16 [steps] and uint8.
+    """
     difference = np.abs(patch.astype(np.int32) - truth)
     difference[truth == VOID] = 0
     rows, columns = _starts(patch.shape[0]), _starts(patch.shape[1])
-    return np.maximum.reduceat(np.maximum.reduceat(difference, rows, axis=0), columns, axis=1).astype(np.uint16)
+    largest = np.maximum.reduceat(np.maximum.reduceat(difference, rows, axis=0), columns, axis=1)
+    far = (difference > target_steps).view(np.uint8)
+    beyond = np.add.reduceat(np.add.reduceat(far, rows, axis=0), columns, axis=1)
+    return largest.astype(np.uint16), beyond.astype(np.uint8)
 
 
 def _starts(size: int) -> IntArray:

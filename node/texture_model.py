@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from protocol.codec import TextureCodec, decode_texture, encode_texture
-from protocol.grid import FloatArray, ImageArray
+from protocol.grid import FloatArray, ImageArray, IntArray
 from protocol.region import Region
 
 QUALITIES = (6, 20, 34, 48, 62)
@@ -95,6 +95,14 @@ class TextureModel:
         tiles = self._share_of_tiles(left * CELL, top * CELL, wide * CELL, high * CELL)
         size_bytes = (self._bytes * tiles).sum(axis=(1, 2)) * self._bias[codec]
         return Expected(np.log(np.maximum(mse, MSE_MIN)), np.log(np.maximum(size_bytes, 1.0)))
+
+    def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
+        """Squared error per value of single blocks at qualities of their own. (n,) each"""
+        scale = np.array(QUALITIES, np.float64)
+        above = np.clip(np.searchsorted(scale, quality), 1, scale.size - 1)
+        part = np.clip((quality - scale[above - 1]) / (scale[above] - scale[above - 1]), 0, 1)
+        low, high = (np.log(np.maximum(self._mse[index, rows, columns], MSE_MIN)) for index in (above - 1, above))
+        return np.asarray(np.exp(low + part * (high - low)))
 
     def learn(self, codec: TextureCodec, expected_bytes: float, actual_bytes: int) -> None:
         """Take note of what a patch really took."""

@@ -228,3 +228,16 @@ def test_a_click_beside_a_held_window_costs_what_is_new(scan: Scan, view: FirstV
     rest = plan_update(scan, viewer.state, Look(1, 0.75, 0.5), "htj2k")
     viewer.take(rest)
     assert rest.wire_bytes < 0.75 * whole
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(places, places, st.sampled_from([0.02, 0.05, 0.1, 0.3])), min_size=2, max_size=5))
+def test_overlapping_windows_reach_their_quality_too(
+    scan: Scan, view: FirstView, model_of_texture: TextureModel, looks: list[tuple[float, float, float]]
+) -> None:
+    viewer = Viewer(scan, view)
+    for u, v, range_mm in looks:
+        look = Look(1, u, v, texture_db=36, range_mm=range_mm)
+        viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture))
+        assert viewer.range_error_mm(look) <= range_mm
+        assert viewer.texture_db(look) >= 35.7
