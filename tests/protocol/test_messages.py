@@ -28,6 +28,8 @@ EVERY: list[m.Message] = [
     m.Hello("foveascan.v1"),
     m.Open(1, "latest", STATEMENT),
     m.Look(1, 0.5, 0.25, parameters=m.LookParameters(m.RangeParameters(), m.TextureParameters(p=1.5))),
+    m.Open(1, "latest", profile="classic"),
+    m.Look(1, 0.5, 0.25, profile="classic", classic=m.ClassicLookParameters(m.ClassicRange(s=2.0), m.ClassicTexture())),
     m.Ack(2, 5, "0123456789abcdef"),
     m.State(2, 5, STATEMENT),
     m.Cancel(1),

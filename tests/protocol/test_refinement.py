@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
 from protocol.lattice import NO_SKIRT, Channel, Parameters
 from protocol.refinement import (
@@ -66,6 +67,18 @@ def test_a_first_view_carries_no_parameters() -> None:
         data = Refinement(wrong[0], Channel.RANGE, 1, 0, 0, 0, 1, 1, b"", b"", wrong[1]).to_bytes()
         with pytest.raises(RemoteWireError):
             Refinement.from_bytes(data)
+
+
+def test_a_classic_fovea_has_parameters_of_its_own() -> None:
+    fovea = ClassicParameters(2, 180, 50, 0.5, 0.5, 2.0, 1.5)
+    classic = Refinement(Generator.CLASSIC, Channel.RANGE, 1, 2, 7, 0, 1, 3, b"abcdef", b"", fovea)
+    data = classic.to_bytes()
+    assert Refinement.from_bytes(data) == classic
+    assert data[HEADER.size : HEADER.size + 22] == struct.pack("<HHHffff", 2, 180, 50, 0.5, 0.5, 2.0, 1.5)
+    assert len(data) == HEADER.size + 22 + 6 + CRC.size and HEADER.size + 22 + CRC.size <= 64
+    for wrong in (None, Parameters(2, 0, 0, 1, 1)):
+        with pytest.raises(RemoteWireError):
+            Refinement.from_bytes(replace(classic, parameters=wrong).to_bytes())
 
 
 def test_the_layout_is_the_documented_one() -> None:

@@ -12,12 +12,14 @@ import pytest
 
 from client import Update, connect
 from client.classic_model import ClassicModel
-from client.errors import RequestRefused
+from client.errors import HoldingsDiffer, RequestRefused
+from client.model import Applied
 from client.truth import Truth
 from client.update import Sent
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError
 from protocol.lattice import Channel
+from protocol.refinement import Refinement
 from tests.system.line import RunningNode
 
 HEADER_MAX = 64
@@ -165,6 +167,25 @@ async def test_a_session_keeps_to_the_profile_it_was_opened_with(head_node: Runn
         model = await session.open()
         assert not isinstance(model, ClassicModel)
         assert (await session.look(0.5, 0.5)).reason == "complete"
+
+
+async def test_a_fovea_that_was_not_taken_in_is_sent_again(
+    head_node: RunningNode, monkeypatch: pytest.MonkeyPatch
+) -> None:  # B.3
+    async with connect(head_node.url) as session:
+        model = await session.open(profile="classic")
+        await session.look(0.3, 0.5, parameters=PAPER)
+        with monkeypatch.context() as patch:
+            patch.setattr(ClassicModel, "apply", disagree)
+            assert (await session.look(0.5, 0.5, parameters=PAPER)).lost == 1
+        assert (await session.look(0.5, 0.5, parameters=PAPER)).samples == 143
+        assert (await session.look(0.3, 0.5, parameters=PAPER)).samples == 0
+        assert np.unique(model.owner).tolist() == [0, 1, 3]
+        assert session.stats.resyncs == 1
+
+
+def disagree(model: ClassicModel, refinement: Refinement) -> Applied:
+    raise HoldingsDiffer("as if something had got lost")
 
 
 def range_mm(truth: Truth) -> np.ndarray:
