@@ -21,6 +21,7 @@ from tests.bench.rivals.caching import (
     windows_of,
     with_replies,
 )  # fmt: skip
+from tests.bench.rivals.contestants import as_large_as_ours
 from tests.bench.rivals.offer import Unreachable, straight
 from tests.bench.roi import geometric_mean
 from tests.bench.scans import SEED, BenchScan, Click, Skipped
@@ -28,7 +29,7 @@ from tests.bench.target import Target
 
 CLICKS = 10
 ASKED = 1.1
-RIVALS = ("JPEG tiles, caching", "HTJ2K tiles, caching", "JPIP, caching", "JPIP, caching, 32 KiB first view")
+RIVALS = ("JPEG tiles, caching", "HTJ2K tiles, caching", "JPIP, caching", "JPIP, caching, as large a first view")
 
 
 def run(scans: list[BenchScan], size: str, cache: Cache) -> dict[str, Any]:
@@ -113,7 +114,7 @@ def _rival_bytes(rival: str, scan: BenchScan, clicks: list[Click], target: Targe
 
 def _sent(rival: str, scan: BenchScan, windows: Windows, cache: Cache) -> list[int]:
     if rival.startswith("JPIP"):
-        free = jpip.AS_LARGE_AS_OURS if rival.endswith("first view") else jpip.AS_COARSE_AS_OURS
+        free = as_large_as_ours(scan) if rival.endswith("first view") else jpip.AS_COARSE_AS_OURS
         return with_replies(jpip_session(scan, windows, cache, free))
     return with_replies(range_session(scan, windows), texture_sessions(scan, windows, rival.split()[0].lower()))
 

@@ -2,30 +2,49 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from functools import partial
+from functools import lru_cache, partial
+from pathlib import Path
 
+from node.first_view import build_first_view
 from tests.bench.cache import Cache
 from tests.bench.rivals import draco_range, htj2k_texture, jpeg_texture, jpeg_whole, jpip, range_tiles
 from tests.bench.rivals.offer import Offer, reply, straight
 from tests.bench.scans import BenchScan, Click
 from tests.bench.target import Target, Window
 
+FIRST_VIEW_BYTES = 32768
+
 Part = Callable[[BenchScan, Window, Cache], Offer]
+
+
+@lru_cache(maxsize=8)
+def as_large_as_ours(scan: BenchScan) -> dict[str, jpip.Free]:
+    """What a JPIP client may hold of a scan before any click, when it is given the bytes of our first view."""
+    with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
+        view = build_first_view(scan.published(Path(folder)), "htj2k", FIRST_VIEW_BYTES)
+    sizes = {"range": len(view.range.payload) + len(view.range.mask), "texture": len(view.texture.payload)}
+    return {channel: jpip.Free(size_bytes=size) for channel, size in sizes.items()}
+
 
 PARTS: Mapping[str, Part] = {
     "draco_full": draco_range.full_offer,
     "draco_tiles": lambda scan, window, _: draco_range.tiles_offer(scan, window),
     "range_tiles": lambda scan, window, _: range_tiles.range_offer(scan, window),
     "jpip_range": partial(jpip.range_offer, free=jpip.AS_COARSE_AS_OURS["range"]),
-    "jpip_range_large": partial(jpip.range_offer, free=jpip.AS_LARGE_AS_OURS["range"]),
+    "jpip_range_large": lambda scan, window, cache: jpip.range_offer(
+        scan, window, cache, as_large_as_ours(scan)["range"]
+    ),
     "jpeg_full": jpeg_whole.texture_offer,
     "progressive_jpeg": jpeg_whole.progressive_offer,
     "jpeg_tiles": lambda scan, window, _: jpeg_texture.texture_offer(scan, window),
     "htj2k_tiles": lambda scan, window, _: htj2k_texture.texture_offer(scan, window),
     "jpip_texture": partial(jpip.texture_offer, free=jpip.AS_COARSE_AS_OURS["texture"]),
-    "jpip_texture_large": partial(jpip.texture_offer, free=jpip.AS_LARGE_AS_OURS["texture"]),
+    "jpip_texture_large": lambda scan, window, cache: jpip.texture_offer(
+        scan, window, cache, as_large_as_ours(scan)["texture"]
+    ),
 }
 SOURCES = {
     "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles", "jpip_range": "jpip",
@@ -38,10 +57,9 @@ RIVALS: Mapping[str, tuple[str, str]] = {
     "JPEG tile pyramid": ("range_tiles", "jpeg_tiles"),
     "HTJ2K tile pyramid": ("range_tiles", "htj2k_tiles"),
     "JPIP": ("jpip_range", "jpip_texture"),
-    "JPIP, 32 KiB first view": ("jpip_range_large", "jpip_texture_large"),
+    "JPIP, as large a first view": ("jpip_range_large", "jpip_texture_large"),
     "progressive JPEG": ("range_tiles", "progressive_jpeg"),
 }
-SMALL = ("JPEG tile pyramid",)  # for a smoke run
 
 
 def bytes_for(rival: str, scan: BenchScan, click: Click, target: Target, cache: Cache) -> Offer:
@@ -57,5 +75,10 @@ def part(name: str, scan: BenchScan, click: Click, target: Target, cache: Cache)
         ready, place = straight(scan, click)
         return asdict(PARTS[name](ready, Window.round(ready.grid, place, target), cache))
 
-    made = cache.value(f"rivals.{SOURCES[name]}", f"{name} {scan.key} {click} {target}", make)
+    made = cache.value(f"rivals.{SOURCES[name]}", f"{name} {scan.key} {click} {target}{edition(name, scan)}", make)
     return Offer(int(made["size_bytes"]), str(made["how"]))
+
+
+def edition(name: str, scan: BenchScan) -> str:
+    """What a part's result hangs on beside its own source: our first view, where it is given as much."""
+    return f" {as_large_as_ours(scan)}" if name.endswith("_large") else ""

@@ -36,7 +36,7 @@ Reached = Callable[[Any], bool]
 
 @dataclass(frozen=True)
 class Free:
-    """What a client holds of each channel before any click.
+    """What a client holds of a channel before any click.
 
     resolutions : of 7, whole ones.  size_bytes : whole resolutions within it, coarsest first, the last one by layers.
     """
@@ -46,7 +46,6 @@ class Free:
 
 
 AS_COARSE_AS_OURS = {"range": Free(resolutions=3), "texture": Free(resolutions=3)}
-AS_LARGE_AS_OURS = {"range": Free(size_bytes=8192), "texture": Free(size_bytes=24576)}
 
 
 def texture_offer(scan: BenchScan, window: Window, cache: Cache, free: Free) -> Offer:
