@@ -42,6 +42,9 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     looker.add_argument("--range-mm", type=_number, default=0.1, metavar="MM", help="range error to stop at (0.1)")
     looker.add_argument("--max-wait", type=_number, metavar="S", help="seconds a look may take")
     looker.add_argument("--max-bytes", type=int, metavar="N", help="bytes a look may take")
+    looker.add_argument(
+        "--profile", choices=["default", "classic"], default="default", help="how to refine; classic: the paper's letter"
+    )
     looker.add_argument("-o", "--output", metavar="FILE", help="write the model; the suffix is the format (.glb ...)")
     looker.set_defaults(run=run_look)
 
@@ -80,7 +83,7 @@ async def _look(args: argparse.Namespace) -> None:
     clicks = args.at or [CENTRE]
     with _progress(args, 1 + len(clicks), "looking") as bar:
         async with connect(args.node or await only_node(args.timeout), token=args.token) as session:
-            model = await session.open(args.scan)
+            model = await session.open(args.scan, profile=args.profile)
             bar.update()
             s = model.info
             shape = [s.height, s.width], [s.texture_height, s.texture_width]

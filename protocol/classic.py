@@ -87,11 +87,11 @@ def first_view_shape(width: int, height: int, channel: Channel) -> tuple[int, in
     is_range = channel is Channel.RANGE
     across, down = RANGE_SPACING if is_range else TEXTURE_SPACING
     most = RANGE_CELLS_MAX if is_range else TEXTURE_CELLS_MAX
-    rows, columns = max(round(height / down), min(height, 2)), max(round(width / across), 1)
-    while rows * columns > most:
-        across, down = 2 * across, 2 * down
+    while True:
         rows, columns = max(round(height / down), min(height, 2)), max(round(width / across), 1)
-    return rows, columns
+        if rows * columns <= most:
+            return rows, columns
+        across, down = 2 * across, 2 * down
 
 
 def first_view_positions(shape: ChannelShape) -> tuple[FloatArray, FloatArray]:
@@ -176,9 +176,7 @@ def build_classic(shape: ChannelShape, parameters: ClassicParameters) -> Classic
     return ClassicLattice(shape, p, x, y, _whole(x), _whole(y))
 
 
-def nearest_fovea(
-    foveae: Iterable[ClassicLattice], rows: IntArray, columns: IntArray
-) -> tuple[IntArray, IntArray]:
+def nearest_fovea(foveae: Iterable[ClassicLattice], rows: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
     """Which fovea owns each dense sample of rows x columns, 0 = none, and its distance.
 
     foveae : oldest first.  columns : may be unwrapped.  Returns two (rows, columns) int64.

@@ -324,7 +324,7 @@ def _refinements() -> dict[str, Any]:
                 "quality": refinement.quality,
                 "samples": refinement.samples,
                 "selfContained": refinement.self_contained,
-                "parameters": _parameters(p) if isinstance(p := refinement.parameters, Parameters) else None,
+                "parameters": _parameters(sent) if isinstance(sent := refinement.parameters, Parameters) else None,
                 "mask": refinement.mask.hex(),
                 "payload": refinement.payload.hex(),
             }

@@ -154,5 +154,3 @@ def test_a_client_that_counts_otherwise_objects(
     with pytest.raises(HoldingsDiffer):
         client.model.apply(replace(honest, samples=spoil(honest)))
     client.model.apply(honest)
-
-

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from client.errors import HoldingsDiffer, RequestRefused
 from client.model import Applied
 from client.truth import Truth
 from client.update import Sent
+from foveascan import main
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError
 from protocol.lattice import Channel
@@ -182,6 +185,17 @@ async def test_a_fovea_that_was_not_taken_in_is_sent_again(
         assert (await session.look(0.3, 0.5, parameters=PAPER)).samples == 0
         assert np.unique(model.owner).tolist() == [0, 1, 3]
         assert session.stats.resyncs == 1
+
+
+def test_the_command_looks_by_the_papers_letter(
+    head_node: RunningNode, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    look = ["look", "--node", head_node.url, "--profile", "classic", "--at", "0.5,0.5", "--json"]
+    assert main([*look, "-o", str(tmp_path / "model.npz")]) == 0
+    opened, update = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert opened["first_view_bytes"] > 2 * 200
+    assert update["samples"] > 2257
+    assert (tmp_path / "model.npz").exists()
 
 
 def disagree(model: ClassicModel, refinement: Refinement) -> Applied:
