@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from node.state import ClientState
-from protocol.grid import BoolArray, StepArray
+from protocol.grid import BoolArray, ImageArray, StepArray
 from protocol.lattice import NO_SKIRT, RHO_MAX, RHO_ONE, Channel, Parameters
 from protocol.reconstruct import Selection
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
@@ -20,7 +20,7 @@ class Coded:
 
     adopted : (by, bx) bool over the lattice's covered blocks.
     rank, quality, codec : as in protocol.holdings and protocol.refinement.
-    patch : range only, the dense rectangle that a client makes of it, voids included.
+    patch : the dense rectangle that a client makes of it, voids included; texture: None where nobody measured it.
     """
 
     selection: Selection
@@ -30,7 +30,7 @@ class Coded:
     codec: int
     payload: bytes
     mask: bytes = b""
-    patch: StepArray | None = None
+    patch: StepArray | ImageArray | None = None
 
     @property
     def channel(self) -> Channel:

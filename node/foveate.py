@@ -19,24 +19,26 @@ import numpy as np
 from node.coded import Coded, wire_overhead
 from node.library import Scan
 from node.quality import FILL, Point, QualitySearch
+from node.range_bitmaps import mend_range
 from node.refine_range import (
     QUANTUM_MAX,
     choose_range,
     code_range,
     expected_range_bytes,
-    mend_range,
     note_range,
     select_range,
 )
 from node.refine_texture import (
     CODECS,
     SPACINGS,
+    adopted_error,
     choose_spacing,
     code_texture,
-    coded_error,
     db_of_mse,
     held_error,
+    measured,
     mse_of_db,
+    note_texture,
     quality_bounds,
     select_texture,
 )
@@ -243,6 +245,7 @@ class _Planner:
             if coded is None:
                 return False
             if search.fits(coded):
+                coded = measured(coded)
                 search.measured(Point(quality, self._texture_error(coded), coded))
             else:
                 search.too_large(quality, coded.wire_bytes)
@@ -251,11 +254,11 @@ class _Planner:
 
     def _texture_error(self, coded: Coded) -> float:
         """Squared error per value that a refinement leaves in the window, what is held there counted as expected."""
-        total, count = coded_error(self._scan, coded, self._texture_region)
-        if self._model is not None:
-            held_total, held_count = held_error(self._state, coded, self._texture_region, self._model)
-            total, count = total + held_total, count + held_count
-        return total / max(count, 1)
+        assert isinstance(coded.patch, np.ndarray)
+        region = self._texture_region
+        total, count = adopted_error(self._scan, coded.selection, region, coded.patch.astype(np.uint8, copy=False))
+        held_total, held_count = held_error(self._state, coded, region, self._model, self._target_mse)
+        return (total + held_total) / max(count + held_count, 1)
 
     def _learn(self, p: float, quality: int, coded: Coded) -> None:
         if self._model is not None and p == 1:
@@ -347,7 +350,7 @@ class _Planner:
         if coded.channel is Channel.RANGE:
             note_range(self._scan, self._state, coded, self._target_steps)
         else:
-            coded.note(self._state)
+            note_texture(self._scan, self._state, coded)
         self._coded.append(coded)
 
 

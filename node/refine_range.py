@@ -6,11 +6,10 @@ fewest bytes wins. Every trial is reconstructed and compared with the scan, as t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from node.coded import Coded, rho_of
 from node.library import Scan
@@ -18,9 +17,9 @@ from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
 from protocol.codec_lift import encode_and_decode, survey
-from protocol.grid import RANGE_BLOCK, VOID, BoolArray
+from protocol.grid import VOID, BoolArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
-from protocol.lattice import Channel, Lattice, Parameters, build_lattice, mask_to_runs
+from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
 from protocol.reconstruct import Selection, content_hashes, cut, range_patch, select
 from protocol.region import Region
@@ -28,7 +27,6 @@ from protocol.region import Region
 SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
 PERCENTILE = 99
 QUANTUM_MAX = 4096
-MENDS_MAX = 3
 QUANTUM_SHARE_MAX = 2.5  # of the target; the error is at most half a quantum, less after interpolation
 
 
@@ -71,7 +69,7 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
 
 def code_range_lattice(scan: Scan, state: ClientState, parameters: Parameters, quantum: int) -> Coded | None:
     """The same for a lattice that is given."""
-    found = _select(state, parameters, quantum)
+    found = select_range_lattice(state, parameters, quantum)
     if found is None:
         return None
     selection, adopted, quantum = found
@@ -88,12 +86,13 @@ def select_range(
     state: ClientState, region: Region, wanted: RangeParameters
 ) -> tuple[Selection, BoolArray, int] | None:
     """What code_range would carry: the selection, the adopted blocks of its lattice, the quantum; None: nothing."""
-    return _select(state, range_lattice(region, wanted), wanted.quantum)
+    return select_range_lattice(state, range_lattice(region, wanted), wanted.quantum)
 
 
-def _select(
+def select_range_lattice(
     state: ClientState, parameters: Parameters, quantum: int
 ) -> tuple[Selection, BoolArray, int] | None:
+    """The same for a lattice that is given."""
     held = state.holdings.channels[Channel.RANGE]
     lattice = build_lattice(held.shape, parameters)
     quantum = min(quantum, _best_held(held, lattice))
@@ -117,65 +116,13 @@ def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float
     """Record a range refinement in a client's state: holdings, digest and the error left in its blocks."""
     assert coded.patch is not None  # code_range made it
     coded.note(state)
-    patch, selection = coded.patch, coded.selection
+    patch, selection = coded.patch.astype(np.uint16, copy=False), coded.selection
     state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
     error, beyond = block_errors(patch, np.asarray(cut(scan.range_steps, selection)), target_steps)
     rows, columns = np.nonzero(selection.adopted)
     blocks = selection.y.block[rows], selection.x.block[columns]
     state.error[blocks], state.beyond[blocks] = error[rows, columns], beyond[rows, columns]
     state.target_steps[blocks] = target_steps
-
-
-def mend_range(
-    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, target_steps: float
-) -> Coded | None:
-    """Encode a refinement after which the whole region is within target_steps, held blocks included.
-
-    Held blocks may have been good enough for the window they were sent for and be too poor for this one: where they
-    are, they are sent again, finer, and with a bitmap so that no other block is.
-    """
-    allowed = (100 - PERCENTILE) / 100 * np.count_nonzero(scan.range_steps[region.rows][:, region.columns])
-    held = state.holdings.channels[Channel.RANGE]
-    beyond = state.cells_beyond(target_steps)
-    coded = code_range(scan, state, region, wanted)
-    for _ in range(MENDS_MAX):
-        kept = np.ones(held.shape.blocks, np.bool_)
-        if coded is not None:
-            kept.ravel()[coded.selection.adopted_blocks()] = False
-        poor = _of_region(np.where(kept, beyond, 0), region)
-        if poor.sum() + _cells_beyond(scan, coded, region, target_steps) <= allowed or not poor.any():
-            return coded
-        rank, level = (_of_region(array, region)[poor > 0] for array in (held.rank, held.level))
-        quantum = min(wanted.quantum, 65535 - int(rank.max())) - 1
-        if quantum < 1:
-            return coded
-        p = next(p for p in SPACINGS if p == 1 or (p <= wanted.p and p * p <= 2 ** int(level.min())))
-        wanted = RangeParameters(p=p, quantum=quantum, s=None)
-        listed = mask_to_runs((poor > 0) | (_of_region(held.rank, region) == COARSE_RANK))
-        coded = code_range_lattice(scan, state, replace(range_lattice(region, wanted), listed=listed), quantum)
-    return coded
-
-
-def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps: float) -> int:
-    """How many of a region's cells a refinement leaves further off than target_steps."""
-    if coded is None or coded.patch is None:
-        return 0
-    selection = coded.selection
-    rows = selection.y.start + np.arange(selection.y.low.size)
-    columns = selection.x.start + np.arange(selection.x.low.size)
-    inside = (rows >= region.top) & (rows < region.top + region.height)
-    across = (columns - region.left) % region.turn < region.width
-    truth = np.asarray(cut(scan.range_steps, selection), np.int32)
-    far = np.abs(coded.patch.astype(np.int32) - truth) > target_steps
-    far &= (truth != VOID) & selection.adopted_cells()
-    return int(np.count_nonzero(far[inside][:, across]))
-
-
-def _of_region(blocks: NDArray[Any], region: Region) -> NDArray[Any]:
-    """The part of a block array that a region touches. (blocks_high, blocks_wide)"""
-    left, top, wide, high = region.blocks(RANGE_BLOCK)
-    columns = np.arange(left, left + wide) % blocks.shape[1]
-    return blocks[top : top + high][:, columns]
 
 
 class _Trial:

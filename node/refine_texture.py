@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from node.coded import Coded, rho_of
 from node.library import Scan
@@ -13,11 +15,11 @@ from node.sample import texture_samples
 from node.state import ClientState
 from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
-from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray
+from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
 from protocol.holdings import ChannelHoldings, texture_rank
 from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice
 from protocol.messages import CodecName, TextureParameters
-from protocol.reconstruct import Selection, select, texture_patch
+from protocol.reconstruct import Selection, cut, select, texture_patch
 from protocol.region import Region
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
@@ -39,7 +41,8 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
         selection = _whole(shape, region, p)
         if selection is None:
             continue
-        total, count = adopted_error(scan, selection, region, texture_samples(scan, selection))
+        patch = texture_patch(selection, texture_samples(scan, selection))
+        total, count = adopted_error(scan, selection, region, patch)
         if total <= allowed * count:
             return p
     return 1
@@ -94,16 +97,36 @@ def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:
     return Parameters(round(2 * wanted.p), *region.blocks(16), rho, rho)
 
 
-def coded_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, int]:
-    """Squared error that a refinement leaves in the part of the region it adopts, and of how many values."""
-    shape = coded.selection.sample_shape
-    texels = decode_texture(coded.payload, TextureCodec(coded.codec), coded.quality, shape)
-    return adopted_error(scan, coded.selection, region, texels)
+def note_texture(scan: Scan, state: ClientState, coded: Coded) -> None:
+    """Record a texture refinement in a client's state: holdings, and the error left in its blocks where measured."""
+    coded.note(state)
+    selection = coded.selection
+    rows, columns = np.nonzero(selection.adopted)
+    blocks = selection.y.block[rows], selection.x.block[columns]
+    state.missed[blocks] = np.nan if coded.patch is None else _block_errors(scan, coded)[rows, columns]
 
 
-def adopted_error(scan: Scan, selection: Selection, region: Region, texels: ImageArray) -> tuple[float, int]:
-    """Squared error over a region's adopted texels, from a selection's (decoded) samples, and of how many values."""
-    patch = texture_patch(selection, texels)
+def _block_errors(scan: Scan, coded: Coded) -> NDArray[np.float32]:
+    """Squared error per value in each block of a measured refinement's rectangle."""
+    assert coded.patch is not None
+    selection = coded.selection
+    missed = cv2.absdiff(coded.patch, np.asarray(cut(scan.texture, selection)))
+    squared = cv2.multiply(missed, missed, dtype=cv2.CV_32F).sum(axis=2)
+    starts_y, starts_x = (np.cumsum(window.size) - window.size for window in (selection.y, selection.x))
+    total = np.add.reduceat(np.add.reduceat(squared, starts_y, axis=0), starts_x, axis=1)
+    return np.asarray(total / (3 * np.multiply.outer(selection.y.size, selection.x.size)), np.float32)
+
+
+def measured(coded: Coded) -> Coded:
+    """A refinement with the dense texture that a client makes of it."""
+    texels = decode_texture(
+        coded.payload, TextureCodec(coded.codec), coded.quality, coded.selection.sample_shape
+    )
+    return replace(coded, patch=texture_patch(coded.selection, texels))
+
+
+def adopted_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, int]:
+    """Squared error of a dense patch over a region's adopted texels, and of how many values."""
     adopted = selection.adopted_cells().view(np.uint8)
     total, count = 0.0, 0
     for rows, columns, source in selection.spans():
@@ -119,17 +142,39 @@ def adopted_error(scan: Scan, selection: Selection, region: Region, texels: Imag
     return total, count
 
 
-def held_error(state: ClientState, coded: Coded, region: Region, model: TextureModel) -> tuple[float, int]:
-    """Squared error expected in the blocks of a region that a refinement leaves as they are, and of how many values."""
+def held_error(
+    state: ClientState, coded: Coded, region: Region, model: TextureModel | None, target_mse: float
+) -> tuple[float, int]:
+    """Squared error in the blocks of a region that a refinement leaves as they are, and of how many values.
+
+    Blocks that were never measured count as the model expects them, or as just good enough without one.
+    """
     kept = np.ones(state.shapes[Channel.TEXTURE].blocks, np.bool_)
     kept.ravel()[coded.selection.adopted_blocks()] = False
     left, top, wide, high = region.blocks(TEXTURE_BLOCK)
     columns = np.arange(left, left + wide) % kept.shape[1]
     rows, across = np.nonzero(kept[top : top + high][:, columns])
-    rank = state.holdings.channels[Channel.TEXTURE].rank[rows + top, columns[across]]
-    values = 3 * TEXTURE_BLOCK * TEXTURE_BLOCK
-    mse = model.mse_at(rows + top, columns[across], rank.astype(np.int64) - 1)
-    return float(values * mse.sum()), values * rows.size
+    rows, across = rows + top, columns[across]
+    mse = state.missed[rows, across].astype(np.float64)
+    unknown = np.isnan(mse)
+    if model is None:
+        mse[unknown] = target_mse
+    elif unknown.any():
+        quality = state.holdings.channels[Channel.TEXTURE].rank[rows, across].astype(np.int64) - 1
+        mse[unknown] = model.mse_at(rows[unknown], across[unknown], quality[unknown])
+    inside = _values_inside(state.shapes[Channel.TEXTURE], region, rows, across)
+    return float(inside @ mse), int(inside.sum())
+
+
+def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> IntArray:
+    """How many of each block's values lie in a region."""
+    top, left = rows * TEXTURE_BLOCK, columns * TEXTURE_BLOCK
+    bottom = np.minimum(top + TEXTURE_BLOCK, shape.height)
+    height = np.minimum(bottom, region.top + region.height) - np.maximum(top, region.top)
+    size = np.minimum(TEXTURE_BLOCK, shape.width - left)
+    across = (left[:, None] + np.arange(TEXTURE_BLOCK) - region.left) % region.turn < region.width
+    width = (across & (np.arange(TEXTURE_BLOCK) < size[:, None])).sum(axis=1)
+    return np.asarray(3 * np.maximum(height, 0) * width, np.int64)
 
 
 def mse_of_db(db: float) -> float:

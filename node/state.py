@@ -21,6 +21,7 @@ class ClientState:
 
     error : (blocks_y, blocks_x) uint16 largest range error left in each block. [steps]
     beyond : likewise uint8, how many of its cells are further off than target_steps, likewise float32.
+    missed : (texture blocks_y, blocks_x) float32 squared error per value left in each block; NaN where not measured.
     """
 
     shapes: dict[Channel, ChannelShape]
@@ -28,10 +29,11 @@ class ClientState:
     error: StepArray
     beyond: NDArray[np.uint8]
     target_steps: NDArray[np.float32]
+    missed: NDArray[np.float32]
 
     def copy(self) -> ClientState:
         """An independent copy, to plan on."""
-        arrays = self.error.copy(), self.beyond.copy(), self.target_steps.copy()
+        arrays = self.error.copy(), self.beyond.copy(), self.target_steps.copy(), self.missed.copy()
         return ClientState(self.shapes, self.holdings.copy(), *arrays)
 
     def cells_beyond(self, target_steps: float) -> IntArray:
@@ -53,7 +55,8 @@ def first_state(scan: Scan, coarse_steps: StepArray) -> ClientState:
     dense = coarse_to_range(coarse_steps, shapes[Channel.RANGE])
     error, beyond = block_errors(dense, scan.range_steps, math.inf)
     target = np.full(error.shape, np.inf, np.float32)  # so that nothing counts as good enough
-    return ClientState(shapes, Holdings.coarse(shapes), error, beyond, target)
+    missed = np.full(shapes[Channel.TEXTURE].blocks, np.nan, np.float32)
+    return ClientState(shapes, Holdings.coarse(shapes), error, beyond, target, missed)
 
 
 def block_errors(patch: StepArray, truth: StepArray, target_steps: float) -> tuple[StepArray, NDArray[np.uint8]]:

@@ -240,4 +240,4 @@ def test_overlapping_windows_reach_their_quality_too(
         look = Look(1, u, v, texture_db=36, range_mm=range_mm)
         viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture))
         assert viewer.range_error_mm(look) <= range_mm
-        assert viewer.texture_db(look) >= 35.7
+        assert viewer.texture_db(look) >= look.texture_db - 0.01
