@@ -43,7 +43,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     looker.add_argument("--max-wait", type=_number, metavar="S", help="seconds a look may take")
     looker.add_argument("--max-bytes", type=int, metavar="N", help="bytes a look may take")
     looker.add_argument(
-        "--profile", choices=["default", "classic"], default="default", help="how to refine; classic: the paper's letter"
+        "--profile", choices=["default", "classic"], default="default", help="default, or the paper's letter"
     )
     looker.add_argument("-o", "--output", metavar="FILE", help="write the model; the suffix is the format (.glb ...)")
     looker.set_defaults(run=run_look)
