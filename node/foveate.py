@@ -40,6 +40,7 @@ from node.refine_texture import (
     mse_of_db,
     note_texture,
     quality_bounds,
+    quality_to_mend,
     select_texture,
 )
 from node.state import ClientState
@@ -243,20 +244,30 @@ class _Planner:
         while (quality := search.next_quality()) is not None:
             coded = self._code_texture(TextureParameters(p, quality, self._codec, self._skirt(p)))
             if coded is None:
-                return False
+                if self._texture_error(None) <= self._target_mse:
+                    return False
+                search.missed_all(quality, self._mending_quality(None))
+                continue
             if search.fits(coded):
                 coded = measured(coded)
-                search.measured(Point(quality, self._texture_error(coded), coded))
+                mse = self._texture_error(coded)
+                search.measured(Point(quality, mse, coded))
+                if mse > self._target_mse:
+                    search.at_least(self._mending_quality(coded))
             else:
                 search.too_large(quality, coded.wire_bytes)
             self._learn(p, quality, coded)
         return True
 
-    def _texture_error(self, coded: Coded) -> float:
-        """Squared error per value that a refinement leaves in the window, what is held there counted as expected."""
-        assert isinstance(coded.patch, np.ndarray)
+    def _mending_quality(self, coded: Coded | None) -> int:
+        return quality_to_mend(self._state, coded, self._texture_region, self._target_mse)
+
+    def _texture_error(self, coded: Coded | None) -> float:
+        """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""
         region = self._texture_region
-        total, count = adopted_error(self._scan, coded.selection, region, coded.patch.astype(np.uint8, copy=False))
+        total, count = 0.0, 0
+        if coded is not None and coded.patch is not None:
+            total, count = adopted_error(self._scan, coded.selection, region, coded.patch.astype(np.uint8, copy=False))
         held_total, held_count = held_error(self._state, coded, region, self._model, self._target_mse)
         return (total + held_total) / max(count + held_count, 1)
 

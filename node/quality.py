@@ -71,6 +71,16 @@ class QualitySearch:
         if self._next in self._tried:
             self._next = None if reached or self.limited else min(point.quality + 1, self._highest)
 
+    def at_least(self, quality: int) -> None:
+        """Less than this leaves blocks as they are that spoil the result."""
+        if self._next is not None:
+            self._lowest = max(self._lowest, min(quality, self._highest))
+            self._next = max(self._next, self._lowest)
+
+    def missed_all(self, quality: int, needed: int) -> None:
+        """A try would be adopted nowhere, and what is held is too poor: at least `needed` would be."""
+        self._next = max(needed, quality + 1) if max(needed, quality + 1) <= self._highest else None
+
     def too_large(self, quality: int, wire_bytes: int) -> None:
         """A try took more than there is; nothing at or above its quality fits."""
         self._highest = quality - 1

@@ -18,20 +18,16 @@ from node.coded import Coded
 from node.library import Scan
 from node.refine_range import (
     PERCENTILE,
-    SPACINGS,
     code_range,
     code_range_lattice,
     range_lattice,
 )
 from node.state import ClientState
 from protocol.grid import RANGE_BLOCK, VOID
-from protocol.holdings import COARSE_RANK
-from protocol.lattice import Channel, mask_to_runs
+from protocol.lattice import Channel, ChannelShape, mask_to_runs
 from protocol.messages import RangeParameters
 from protocol.reconstruct import cut
 from protocol.region import Region
-
-MENDS_MAX = 3
 
 
 def mend_range(
@@ -42,31 +38,38 @@ def mend_range(
     Held blocks may have been good enough for the window they were sent for and be too poor for this one: where they
     are, they are sent again, finer, and with a bitmap so that no other block is.
     """
-    allowed = _allowed_beyond(scan, region)
     held = state.holdings.channels[Channel.RANGE]
-    beyond = state.cells_beyond(target_steps)
     coded = code_range(scan, state, region, wanted)
-    for _ in range(MENDS_MAX):
-        kept = np.ones(held.shape.blocks, np.bool_)
-        if coded is not None:
-            kept.ravel()[coded.selection.adopted_blocks()] = False
-        poor = _of_region(np.where(kept, beyond, 0), region)
-        if poor.sum() + _cells_beyond(scan, coded, region, target_steps) <= allowed or not poor.any():
-            return coded
-        rank, level = (_of_region(array, region)[poor > 0] for array in (held.rank, held.level))
-        quantum = min(wanted.quantum, 65535 - int(rank.max())) - 1
-        if quantum < 1:
-            return coded
-        p = next(p for p in SPACINGS if p == 1 or (p <= wanted.p and p * p <= 2 ** int(level.min())))
-        wanted = RangeParameters(p=p, quantum=quantum, s=None)
-        listed = mask_to_runs((poor > 0) | (_of_region(held.rank, region) == COARSE_RANK))
-        coded = code_range_lattice(scan, state, replace(range_lattice(region, wanted), listed=listed), quantum)
-    return coded
+    kept = np.ones(held.shape.blocks, np.bool_)
+    if coded is not None:
+        kept.ravel()[coded.selection.adopted_blocks()] = False
+    poor = np.where(_of_region(kept, region), _of_region(state.cells_beyond(target_steps), region), 0)
+    poor = np.minimum(poor, _cells_inside(held.shape, region))
+    if poor.sum() + _cells_beyond(scan, coded, region, target_steps) <= _allowed_beyond(scan, region):
+        return coded
+    finer = 65535 - int(_of_region(held.rank, region)[poor > 0].max(initial=0)) - 1
+    quantum = min(wanted.quantum, 2 * int(target_steps) + 1, finer)
+    if quantum < 1:
+        return coded
+    listed = mask_to_runs((poor > 0) | ~_of_region(kept, region))
+    exact = RangeParameters(p=1, quantum=quantum, s=None)  # at spacing 1 no cell is off by more than half a quantum
+    return code_range_lattice(scan, state, replace(range_lattice(region, exact), listed=listed), quantum)
 
 
-def _allowed_beyond(scan: Scan, region: Region) -> float:
-    """How many cells of a region may be further off than its target."""
-    return (100 - PERCENTILE) / 100 * np.count_nonzero(scan.range_steps[region.rows][:, region.columns])
+def _cells_inside(shape: ChannelShape, region: Region) -> NDArray[np.int64]:
+    """How many cells of each block that a region touches lie in it. (blocks_high, blocks_wide)"""
+    left, top, wide, high = region.blocks(RANGE_BLOCK)
+    row = np.arange(top * RANGE_BLOCK, (top + high) * RANGE_BLOCK)
+    column = np.arange(left * RANGE_BLOCK, (left + wide) * RANGE_BLOCK)
+    rows = ((row >= region.top) & (row < region.top + region.height)).reshape(high, RANGE_BLOCK).sum(axis=1)
+    across = ((column - region.left) % region.turn < region.width).reshape(wide, RANGE_BLOCK).sum(axis=1)
+    return np.asarray(np.multiply.outer(rows, across), np.int64)
+
+
+def _allowed_beyond(scan: Scan, region: Region) -> int:
+    """How many measured cells of a region may be further off than its target (99th percentile, "higher")."""
+    measured = int(np.count_nonzero(scan.range_steps[region.rows][:, region.columns]))
+    return max(measured - 1, 0) * (100 - PERCENTILE) // 100
 
 
 def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps: float) -> int:

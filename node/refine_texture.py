@@ -16,7 +16,7 @@ from node.state import ClientState
 from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
 from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
-from protocol.holdings import ChannelHoldings, texture_rank
+from protocol.holdings import RANK_MARGIN, ChannelHoldings, texture_rank
 from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, select, texture_patch
@@ -143,14 +143,15 @@ def adopted_error(scan: Scan, selection: Selection, region: Region, patch: Image
 
 
 def held_error(
-    state: ClientState, coded: Coded, region: Region, model: TextureModel | None, target_mse: float
+    state: ClientState, coded: Coded | None, region: Region, model: TextureModel | None, target_mse: float
 ) -> tuple[float, int]:
     """Squared error in the blocks of a region that a refinement leaves as they are, and of how many values.
 
     Blocks that were never measured count as the model expects them, or as just good enough without one.
     """
     kept = np.ones(state.shapes[Channel.TEXTURE].blocks, np.bool_)
-    kept.ravel()[coded.selection.adopted_blocks()] = False
+    if coded is not None:
+        kept.ravel()[coded.selection.adopted_blocks()] = False
     left, top, wide, high = region.blocks(TEXTURE_BLOCK)
     columns = np.arange(left, left + wide) % kept.shape[1]
     rows, across = np.nonzero(kept[top : top + high][:, columns])
@@ -164,6 +165,18 @@ def held_error(
         mse[unknown] = model.mse_at(rows[unknown], across[unknown], quality[unknown])
     inside = _values_inside(state.shapes[Channel.TEXTURE], region, rows, across)
     return float(inside @ mse), int(inside.sum())
+
+
+def quality_to_mend(state: ClientState, coded: Coded | None, region: Region, target_mse: float) -> int:
+    """The quality at which the too poor blocks that a refinement leaves as they are would be sent again; 0: none is."""
+    held = state.holdings.channels[Channel.TEXTURE]
+    kept = np.ones(held.shape.blocks, np.bool_)
+    if coded is not None:
+        kept.ravel()[coded.selection.adopted_blocks()] = False
+    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
+    place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % kept.shape[1])
+    poor = kept[place] & (state.missed[place] > target_mse)
+    return int(held.rank[place][poor].max(initial=0)) - 1 + RANK_MARGIN[Channel.TEXTURE] if poor.any() else 0
 
 
 def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> IntArray:
