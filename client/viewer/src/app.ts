@@ -35,7 +35,7 @@ export class App {
   private readonly link = h('p', { id: 'link', role: 'status' }, strings.link.connecting);
   private readonly retry = h('button', { type: 'button', class: 'secondary', hidden: true, click: () => this.tell({ kind: 'retry' }) }, strings.link.again);
   private readonly notice = h('p', { id: 'notice', role: 'status' });
-  private readonly hint = h('p', { id: 'hint' }, strings.view.hint);
+  private readonly hint = h('p', { id: 'hint' }, strings.view.hints.sharpen);
   private readonly empty = h('p', { id: 'empty', hidden: true }, strings.view.empty);
   private readonly stage: Stage;
   private readonly marks: Marks;
@@ -113,6 +113,9 @@ export class App {
         break;
       case 'opened':
         this.opened(said.snapshot, said.fresh);
+        break;
+      case 'restored':
+        document.documentElement.dataset['restored'] = 'yes';
         break;
       case 'patch':
         this.stage.patch(said.channel, said.changed, said.level);
@@ -364,6 +367,7 @@ export class App {
   }
 
   private toolChanged(tool: Tool): void {
+    this.hint.textContent = strings.view.hints[tool];
     if (tool !== 'pin') this.pinsPanel.ask(null);
     this.setMeasured([]);
     if (tool === 'measure') this.say(strings.measure.first);

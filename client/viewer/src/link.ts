@@ -49,6 +49,7 @@ export type LinkState =
 export type FromWorker =
   | { kind: 'link'; link: LinkState }
   | { kind: 'opened'; snapshot: Snapshot; fresh: boolean; bytes: number }
+  | { kind: 'restored' }
   | { kind: 'patch'; channel: Channel; changed: Changed[]; level: Uint8Array }
   | { kind: 'updated'; answer: Answer }
   | { kind: 'refused'; look: number; code: string; message: string }

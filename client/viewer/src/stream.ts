@@ -98,6 +98,7 @@ export class Stream {
       if (!this.model?.complete) return;
       this.tell({ kind: 'opened', snapshot: snapshotOf(this.model), fresh: false, bytes: 0 });
       if (this.model.hasTexels) this.tellAllTexels(this.model);
+      this.tell({ kind: 'restored' });
     });
   }
 

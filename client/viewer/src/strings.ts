@@ -19,8 +19,11 @@ export const strings = {
   view: {
     label: '3D view of the scan. Arrow keys turn it, plus and minus zoom, Shift and arrows move it, Enter sharpens the middle, Home shows everything.',
     empty: 'No scan yet. Start a sweep, and watch it appear here.',
-    hint: 'Click to sharpen · drag to turn · wheel to zoom',
-    sharpening: 'Sharpening…',
+    hints: {
+      sharpen: 'Click to sharpen · drag to turn · wheel to zoom',
+      measure: 'Click two points to measure · drag to turn · wheel to zoom',
+      pin: 'Click where the pin goes · drag to turn · wheel to zoom',
+    },
     live: (percent: number, seconds: number | null) =>
       `Sweep ${percent.toFixed(0)} %${seconds === null ? '' : `, ${Math.ceil(seconds)} s left`}`,
     home: 'Whole object',
@@ -118,8 +121,8 @@ export const strings = {
       [db === null ? '' : `colour ${db >= 99 ? 'exact' : `${db.toFixed(1)} dB`}`, mm === null ? '' : `shape within ${mm.toPrecision(2)} mm`]
         .filter(Boolean).join(', ') || 'already as sharp as asked for',
     limited: 'stopped at the limit',
-    bandwidth: 'Bytes received per second',
-    chartQuality: 'Quality of each update',
+    bandwidth: 'Received, KB/s over the last minute',
+    chartQuality: 'Quality of each update, dB',
     kilobytes: 'KB/s',
     decibel: 'dB',
   },

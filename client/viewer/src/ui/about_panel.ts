@@ -34,8 +34,8 @@ export class AboutPanel {
     this.dialog = h('dialog', { 'aria-labelledby': 'sure' }, h('article', {}, h('p', { id: 'sure' }, about.sure),
       h('footer', { class: 'row' }, h('button', { type: 'button', class: 'secondary', click: close }, about.no),
         h('button', { type: 'button', class: 'danger', click: yes }, about.yes))));
-    this.remove = h('button', { type: 'button', class: 'secondary outline', click: () => this.dialog.showModal() }, about.remove);
-    const copy = h('button', { type: 'button', class: 'secondary outline', click: () => void this.copy() }, about.copy);
+    this.remove = h('button', { type: 'button', class: 'secondary', click: () => this.dialog.showModal() }, about.remove);
+    const copy = h('button', { type: 'button', class: 'secondary', click: () => void this.copy() }, about.copy);
     this.element = section(about.heading, false, this.samples, this.form,
       h('p', { class: 'label' }, about.download), this.downloads, copy, this.copied, this.remove, this.dialog);
     this.element.hidden = true;

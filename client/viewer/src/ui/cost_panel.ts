@@ -58,7 +58,7 @@ export class CostPanel {
     if (this.plots || !this.element.open || !this.charts[0].clientWidth) return;
     const { cost } = strings;
     const colour = getComputedStyle(this.element).getPropertyValue('--pico-primary').trim() || '#06c';
-    const ink = getComputedStyle(this.element).getPropertyValue('--pico-muted-color').trim() || '#777';
+    const ink = getComputedStyle(this.element).getPropertyValue('--quiet').trim() || '#777';
     const axes = [{ stroke: ink, grid: { show: false }, size: 26 }, { stroke: ink, size: 44, grid: { stroke: ink, width: 0.2 } }];
     const options = (label: string, series: Partial<uPlot.Series>): uPlot.Options => ({
       width: this.charts[0].clientWidth, height: CHART_HEIGHT, legend: { show: false }, cursor: { show: false },
@@ -66,7 +66,7 @@ export class CostPanel {
     });
     this.plots = [
       new uPlot({ ...options(cost.kilobytes, { fill: `${colour}33`, points: { show: false } }), scales: { x: { time: false }, y: { range: (_u, _min, max) => [0, Math.max(max, 10)] } } }, [[], []], this.charts[0]),
-      new uPlot({ ...options(cost.decibel, { points: { show: true, size: 6 } }), scales: { x: { time: false, range: (_u, _min, max) => [Math.max(0, max - SECONDS), Math.max(max, 1)] }, y: { range: [20, 60] } } }, [[], []], this.charts[1]),
+      new uPlot({ ...options(cost.decibel, { points: { show: true, size: 6 } }), scales: { x: { time: false, range: () => [1 - SECONDS, 0] }, y: { range: [20, 60] } } }, [[], []], this.charts[1]),
     ];
     this.draw();
   }
@@ -75,7 +75,7 @@ export class CostPanel {
     this.plot();
     if (!this.plots || !this.element.open) return;
     this.plots[0].setData([this.perSecond.map((_, index) => index - SECONDS + 1), this.perSecond]);
-    this.plots[1].setData([this.qualities.map(([at]) => at), this.qualities.map(([, db]) => Math.min(db, 60))]);
+    this.plots[1].setData([this.qualities.map(([at]) => at - performance.now() / 1000), this.qualities.map(([, db]) => Math.min(db, 60))]);
   }
 
   private resize(): void {

@@ -16,13 +16,16 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   return element;
 }
 
+let choices = 0;
+
 /** A labelled choice of one of several. */
 export function choice(
   label: string, options: Record<string, string>, chosen: string, changed: (value: string) => void,
-): HTMLLabelElement {
-  const select = h('select', { change: () => changed(select.value) });
+): HTMLDivElement {
+  const id = `choice-${++choices}`;
+  const select = h('select', { id, change: () => changed(select.value) });
   for (const [value, text] of Object.entries(options)) select.append(h('option', { value, selected: value === chosen }, text));
-  return h('label', {}, label, select);
+  return h('div', {}, h('label', { for: id }, label), select);
 }
 
 /** A part of the side panel that folds. */

@@ -33,6 +33,7 @@ export class Marks {
 
   setMeasured(places: Place[], distanceMm: number | null): void {
     this.measured = places;
+    this.result.dataset['places'] = places.map(({ u, v }) => `${u},${v}`).join(' ');
     refill(this.result, distanceMm === null ? null : strings.measure.result(distanceMm));
     this.update();
   }

@@ -162,13 +162,21 @@ ${GRID}
 uniform usampler2D uLevel;
 out vec4 packed;
 
-float slope(int column, int row, int dx, int dy, float here) {
-  float before = float(stepsAt(column - dx, row - dy)), after = float(stepsAt(column + dx, row + dy));
-  if (row - dy < 0) before = 0.0;
-  if (row + dy >= uSize.y) after = 0.0;
-  float known = float(before > 0.0) + float(after > 0.0);
-  if (known == 0.0) return 0.0;
-  return ((after > 0.0 ? after : here) - (before > 0.0 ? before : here)) / (known * float(dx + dy));
+int levelAt(int column, int row) {
+  return int(texelFetch(uLevel, ivec2(wrap(column), clamp(row, 0, uSize.y - 1)) / 8, 0).r);
+}
+
+/* Steps at a neighbour, or 0 where none is, or only a coarser guess: that would draw a scar round what is sharp. */
+float known(int column, int row, int level) {
+  if (row < 0 || row >= uSize.y || levelAt(column, row) > level + 1) return 0.0;
+  return float(stepsAt(column, row));
+}
+
+float slope(int column, int row, int dx, int dy, int level, float here) {
+  float before = known(column - dx, row - dy, level), after = known(column + dx, row + dy, level);
+  float sides = float(before > 0.0) + float(after > 0.0);
+  if (sides == 0.0) return 0.0;
+  return ((after > 0.0 ? after : here) - (before > 0.0 ? before : here)) / (sides * float(dx + dy));
 }
 
 void main() {
@@ -178,10 +186,10 @@ void main() {
     packed = vec4(0.0);
     return;
   }
-  float level = float(texelFetch(uLevel, at / 8, 0).r);
-  int reach = max(1, int(exp2(0.5 * level) + 0.5));
-  float roundSlope = slope(at.x, at.y, reach, 0, here) * float(uSize.x) / (TURN * here);
-  float downSlope = slope(at.x, at.y, 0, reach, here) * uStepMm / uPitchMm;
+  int level = levelAt(at.x, at.y);
+  int reach = max(1, int(exp2(0.5 * float(level)) + 0.5));
+  float roundSlope = slope(at.x, at.y, reach, 0, level, here) * float(uSize.x) / (TURN * here);
+  float downSlope = slope(at.x, at.y, 0, reach, level, here) * uStepMm / uPitchMm;
   vec3 normal = normalize(vec3(1.0, -roundSlope, downSlope));
   packed = vec4(normal * 0.5 + 0.5, 1.0);
 }

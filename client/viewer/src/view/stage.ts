@@ -65,6 +65,7 @@ export class Stage {
     this.controls.addEventListener('end', () => this.move(false));
     canvas.addEventListener('webglcontextlost', (event) => {
       event.preventDefault();
+      this.clear(); // now, while deleting what is gone does nothing
       this.events.lost();
     });
     canvas.addEventListener('webglcontextrestored', () => this.events.restored());

@@ -99,7 +99,7 @@ export class Surface {
     this.overlayed = overlay;
     const levels = this.levels[overlay ?? RANGE];
     this.uniforms['uMode']!.value = SHADINGS.indexOf(shading);
-    this.uniforms['uOverlay']!.value = overlay === null ? 0 : 0.62;
+    this.uniforms['uOverlay']!.value = overlay === null ? 0 : 0.5;
     this.uniforms['uLevel']!.value = levels;
     const { width, height, textureWidth, textureHeight } = this.info;
     const scale = overlay === TEXTURE ? [textureWidth / TEXTURE_BLOCK, textureHeight / TEXTURE_BLOCK] : [width / RANGE_BLOCK, height / RANGE_BLOCK];

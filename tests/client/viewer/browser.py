@@ -1,0 +1,93 @@
+"""Debian's chromium with the page in it, and pictures of what it draws."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, Page, Playwright
+
+CHROMIUM = "/usr/bin/chromium"
+# Software rendering, so that every machine draws alike; and no calls home.
+ARGUMENTS = (
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+WAIT_MS = 20_000
+Picture = NDArray[np.float64]
+
+
+def launch(playwright: Playwright) -> Browser:
+    """A browser of this machine; none is downloaded."""
+    return playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+
+
+@contextmanager
+def opened(browser: Browser, address: str, allowed: str = "\0", **options: Any) -> Iterator[Page]:
+    """The page at an address once a scan is drawn; fails afterwards if it complained or asked anybody else.
+
+    allowed : what it may complain of.
+    """
+    with blank(browser, **options) as (page, problems):
+        page.goto(address)
+        page.wait_for_selector("html[data-scan]", state="attached")
+        wait_drawn(page)
+        yield page
+    unexpected = [problem for problem in problems if allowed not in problem]
+    assert not unexpected, unexpected
+
+
+@contextmanager
+def blank(browser: Browser, **options: Any) -> Iterator[tuple[Page, list[str]]]:
+    """An empty page, and the list of what it will complain of."""
+    context = browser.new_context(**{"viewport": {"width": 1000, "height": 700}, "reduced_motion": "reduce", **options})
+    context.set_default_timeout(WAIT_MS)
+    page, problems = context.new_page(), list[str]()
+    page.on("console", lambda said: problems.append(said.text) if said.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("request", lambda request: None if _is_local(request.url) else problems.append(f"asked {request.url}"))
+    try:
+        yield page, problems
+    finally:
+        context.close()
+
+
+def _is_local(url: str) -> bool:
+    return url.startswith(("http://127.0.0.1", "ws://127.0.0.1", "blob:", "data:"))
+
+
+def wait_drawn(page: Page) -> None:
+    """Until what is known is on the screen: two frames after now."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))")
+
+
+def wait_updates(page: Page, count: int) -> None:
+    """Until so many looks are answered and drawn."""
+    page.wait_for_selector(f'html[data-updates="{count}"][data-looking="no"]', state="attached")
+    wait_drawn(page)
+
+
+def click(page: Page, x: float, y: float) -> None:
+    """Click the picture at shares of its width and height."""
+    box = page.locator("#view").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+
+
+def crop(page: Page, x: float, y: float, side: int) -> Picture:
+    """What is drawn round a place of the picture: (side, side, 3) 0..255."""
+    box = page.locator("#view").bounding_box()
+    assert box is not None
+    left, top = box["x"] + x * box["width"] - side / 2, box["y"] + y * box["height"] - side / 2
+    png = page.screenshot(clip={"x": left, "y": top, "width": side, "height": side})
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), np.float64)
+
+
+def psnr(one: Picture, other: Picture) -> float:
+    """How alike two pictures are. [dB]"""
+    return float(10 * np.log10(255**2 / max(float(np.mean((one - other) ** 2)), 1e-3)))

@@ -1,0 +1,228 @@
+"""The page in a real browser, before the real daemon and the simulated scanner."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+import hatch_build
+from foveascan import started
+from tests.client.viewer.browser import blank, click, crop, launch, opened, psnr, wait_drawn, wait_updates
+from tests.system.line import RunningNode, run_line
+
+AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
+FAST = ("--link-rate", "20000000")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        running = launch(playwright)
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
+    """A node with the generated head at M."""
+    with ExitStack() as stack, ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
+        yield aside.submit(run_line, stack, tmp_path_factory.mktemp("page"), "--size", "M", *FAST).result()
+
+
+def test_a_click_sharpens_what_it_is_at(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        click_at = (0.5, 0.42)
+        coarse = crop(page, *click_at, 90)
+        click(page, *click_at)
+        wait_updates(page, 1)
+        sharp = crop(page, *click_at, 90)
+        everything(page)
+        click(page, *click_at)
+        wait_updates(page, 2)
+        full = crop(page, *click_at, 90)
+    assert psnr(sharp, full) >= 32
+    assert psnr(sharp, full) >= psnr(coarse, full) + 6
+
+
+def test_distances_are_true_within_one_percent(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        page.get_by_label("measures").check()
+        click(page, 0.46, 0.5)
+        click(page, 0.55, 0.45)
+        output = page.locator("output.distance")
+        shown_mm = float((output.text_content() or "").removesuffix(" mm"))
+        places = [tuple(map(float, place.split(","))) for place in (output.get_attribute("data-places") or "").split()]
+    assert shown_mm == pytest.approx(math.dist(*(point(node, *place) for place in places)), rel=0.01)
+    assert shown_mm > 20
+
+
+def test_the_address_reproduces_the_view(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        page.locator("#view").focus()
+        for key in ("ArrowRight", "ArrowRight", "ArrowUp", "+", "+"):
+            page.keyboard.press(key)
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        page.wait_for_url("**fovea=**")
+        wait_drawn(page)
+        address, before = page.url, crop(page, 0.5, 0.5, 300)
+    with opened(browser, address) as page:
+        wait_updates(page, 1)
+        assert psnr(crop(page, 0.5, 0.5, 300), before) > 45
+
+
+def test_a_lost_graphics_context_comes_back_as_it_was(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url, allowed="Context") as page:
+        click(page, 0.5, 0.45)
+        wait_updates(page, 1)
+        page.mouse.move(2, 2)
+        before = crop(page, 0.5, 0.45, 200)
+        page.evaluate("() => (window.lose = document.querySelector('#view').getContext('webgl2')"
+                      ".getExtension('WEBGL_lose_context')).loseContext()")  # fmt: skip
+        wait_drawn(page)
+        page.evaluate("() => window.lose.restoreContext()")
+        page.wait_for_selector("html[data-restored]", state="attached")
+        wait_drawn(page)
+        assert psnr(crop(page, 0.5, 0.45, 200), before) > 40
+
+
+def test_everything_can_be_done_by_keyboard(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        before = crop(page, 0.5, 0.5, 300)
+        tab_to(page, "#view")
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("Enter")
+        wait_updates(page, 1)
+        assert psnr(crop(page, 0.5, 0.5, 300), before) < 35
+        page.keyboard.press("Home")
+        tab_to(page, "button:has-text('Sharpen the middle')")
+        page.keyboard.press("Enter")
+        wait_updates(page, 2)
+        tab_to(page, "summary:has-text('Display')")
+        page.keyboard.press("Enter")
+        assert page.get_by_label("Overlay").is_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1000, 360])
+def test_axe_finds_nothing(browser: Browser, node: RunningNode, scheme: str, width: int) -> None:
+    with opened(browser, node.url, color_scheme=scheme, viewport={"width": width, "height": 800}) as page:
+        page.locator("aside details").evaluate_all("(all) => all.forEach((one) => (one.open = true))")
+        page.get_by_label("Overlay").select_option("range")
+        page.evaluate(AXE.read_text())
+        found = page.evaluate("() => axe.run()")
+        assert [(problem["id"], [one["html"] for one in problem["nodes"]]) for problem in found["violations"]] == []
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+
+
+def test_pins_stay_with_the_scan(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        page.get_by_label("sets a pin").check()
+        click(page, 0.5, 0.5)
+        with page.expect_response(lambda answer: answer.request.method == "PATCH") as answered:
+            page.get_by_label("Label of the new pin").fill("mole <b>3</b>")
+            page.keyboard.press("Enter")
+        assert answered.value.ok
+    with opened(browser, node.url) as page:
+        pin = page.get_by_role("button", name="Show pin mole <b>3</b>")
+        page.locator("summary:has-text('Pins')").click()
+        assert pin.is_visible()
+        with page.expect_response(lambda answer: answer.request.method == "PATCH"):
+            page.get_by_role("button", name="Remove pin mole <b>3</b>").click()
+        pin.wait_for(state="detached")
+
+
+def test_downloads_are_whole_files(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        page.locator("summary:has-text('This scan')").click()
+        with page.expect_download() as download:
+            page.get_by_role("link", name="GLB").click()
+        assert Path(download.value.path()).read_bytes()[:4] == b"glTF"
+
+
+def test_a_sweep_appears_as_it_runs_and_a_cut_line_is_taken_up_again(browser: Browser, tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        scanner = ["simulate", "--path", str(tmp_path / "scanner"), "--json"]
+        _, ready = stack.enter_context(started(*scanner))
+        serve = ["serve", "--scanner", ready["path"], "--library", str(tmp_path / "library"), "--insecure", "--json"]
+        listen = f"127.0.0.1:{free_port()}"
+        first = ExitStack()
+        process, at = first.enter_context(started(*serve, "--listen", listen))
+        page, problems = stack.enter_context(blank(browser))
+        with first:
+            page.goto(at["url"])
+            watch_a_sweep(page)
+            click(page, 0.5, 0.5)
+            wait_updates(page, 1)
+            picture = crop(page, 0.5, 0.45, 200)
+            assert problems == []
+            process.kill()
+            page.wait_for_selector('html[data-link="lost"]', state="attached")
+            assert "No connection" in (page.locator("#link").text_content() or "")
+        spent = received(page)
+        stack.enter_context(started(*serve, "--listen", listen))
+        page.wait_for_selector('html[data-link="ready"]', state="attached")
+        page.mouse.move(2, 2)
+        assert psnr(crop(page, 0.5, 0.45, 200), picture) > 40
+        assert received(page) - spent < 1500, "something was sent twice"
+        click(page, 0.5, 0.5)
+        wait_updates(page, 2)
+
+
+def watch_a_sweep(page: Page) -> None:
+    """Start one by its button; see it appear, and become a scan."""
+    page.get_by_role("button", name="Start a sweep").click(timeout=20_000)
+    page.wait_for_selector('html[data-live="yes"]', state="attached")
+    empty = crop(page, 0.5, 0.45, 200)
+    progress = page.get_by_label("Progress of the sweep")
+    progress.wait_for()
+    page.wait_for_selector('html[data-live="no"][data-scan]', state="attached")
+    wait_drawn(page)
+    assert psnr(crop(page, 0.5, 0.45, 200), empty) < 25
+
+
+def everything(page: Page) -> None:
+    """Ask the next click for the whole scan, exactly."""
+    page.get_by_label("Quality", exact=True).select_option("exact")
+    page.get_by_label("Area round the click").select_option("1")
+
+
+def tab_to(page: Page, selector: str) -> None:
+    """Press Tab until something has the focus."""
+    for _ in range(60):
+        if page.locator(selector).evaluate("(element) => element === document.activeElement"):
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"{selector} cannot be reached by Tab")
+
+
+def received(page: Page) -> int:
+    """Bytes that the page says it has received."""
+    amount, unit = (page.locator("#received").text_content() or "").split()
+    return int(float(amount) * {"B": 1, "KB": 1e3, "MB": 1e6}[unit])
+
+
+def point(node: RunningNode, u: float, v: float) -> tuple[float, float, float]:
+    """Where the truth says that a place is. [mm]"""
+    with np.load(node.folder / "truth.npz") as truth:
+        steps, step_mm, bottom_mm, top_mm = (truth[key] for key in ("depth_u16", "scale_mm", "z_min_mm", "z_max_mm"))
+    height, width = steps.shape
+    radius_mm, angle = float(steps[int(v * height), int(u * width)] * step_mm), 2 * math.pi * u
+    return radius_mm * math.cos(angle), radius_mm * math.sin(angle), float(v * (bottom_mm - top_mm))
+
+
+def free_port() -> int:
+    """A port nobody listens at just now."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+        return port
