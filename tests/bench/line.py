@@ -23,6 +23,7 @@ from node.foveate import Update, plan_update
 from node.library import Scan
 from node.refine_texture import texture_lattice
 from node.sample import texture_samples
+from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MIN, jpeg_q
 from protocol.framing import USB_PAYLOAD_MAX, Frame, FrameReader, encode_frame
 from protocol.grid import Grid, ImageArray
@@ -59,11 +60,11 @@ class Case:
 
     codec: CodecName
     texture_p: float
-    range_p: int = 2
+    quick: bool = False
 
     @property
     def name(self) -> str:
-        return f"{self.codec}, texture p {self.texture_p:g}, range p {self.range_p}"
+        return f"{self.codec}{', quick' if self.quick else ''}, texture p {self.texture_p:g}, range p 2"
 
     def look(self, u: float, v: float) -> Look:
         texture = TextureParameters(p=self.texture_p, quality=QUALITY, codec=self.codec)
@@ -71,7 +72,11 @@ class Case:
         return Look(1, u, v, WINDOW, parameters=LookParameters(range_, texture))
 
 
-CASES = tuple(Case(codec, p) for codec in CODECS for p in (1, 2))
+CASES = (
+    *(Case(codec, p) for codec in CODECS for p in (1, 2)),
+    Case("jpeg", 1, quick=True),
+    Case("jpeg", 2, quick=True),
+)
 
 
 def run(scan: BenchScan, clicks: int, repeats: int, sizes: Iterable[str] = tuple(SIZES)) -> dict[str, Any]:
@@ -144,15 +149,15 @@ def update(scan: Scan, case: Case, click: tuple[float, float], repeats: int) -> 
     patch = texture_patch_sent(scan, view, look)
     whole_look = LookParameters(texture=look.parameters.texture if look.parameters else None)
     texture_look = Look(1, *click, WINDOW, parameters=whole_look)
-    refinements = _plan(scan, view, look, case.codec)[1]
+    refinements = _plan(scan, view, look, case)[1]
     flags = [cv2.IMWRITE_JPEG_QUALITY, jpeg_q(max(QUALITY, JPEG_QUALITY_MIN)), cv2.IMWRITE_JPEG_SAMPLING_FACTOR]
     flags.append(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
     encoded = cv2.imencode(".jpg", patch, flags)[1]
     model = opened_model(view)
     jobs: dict[str, Callable[[], Any]] = {
         "imencode": lambda: cv2.imencode(".jpg", patch, flags),
-        "node": lambda: _plan(scan, view, look, case.codec),
-        "node_texture": lambda: _plan(scan, view, texture_look, case.codec),
+        "node": lambda: _plan(scan, view, look, case),
+        "node_texture": lambda: _plan(scan, view, texture_look, case),
         "imdecode": lambda: cv2.imdecode(encoded, cv2.IMREAD_COLOR),
         "client": lambda: [_fresh(model).apply(refinement) for refinement in refinements],
         "client_fresh": lambda: [_fresh(model) for _ in refinements],
@@ -175,10 +180,11 @@ def update(scan: Scan, case: Case, click: tuple[float, float], repeats: int) -> 
 def searched(published: Scan, scan: BenchScan, clicks: int) -> dict[str, Any]:
     """How many images the node encodes when it chooses the parameters itself."""
     encodes: dict[str, list[int]] = {}
+    model = TextureModel(published.texture)
     for codec in CODECS:
         view = build_first_view(published, codec, FIRST_VIEW_BYTES)
         looks = [Look(1, u, v, WINDOW) for u, v in scan.clicks(clicks)]
-        encodes[codec] = [plan_update(published, view.state, look, codec).encodes for look in looks]
+        encodes[codec] = [plan_update(published, view.state, look, codec, model=model).encodes for look in looks]
     return {f"encodes_{codec}": counts for codec, counts in encodes.items()}
 
 
@@ -244,8 +250,8 @@ def _fresh(model: Model) -> Model:
     return model
 
 
-def _plan(scan: Scan, view: FirstView, look: Look, codec: CodecName) -> tuple[Update, list[Refinement]]:
-    planned = plan_update(scan, view.state, look, codec)
+def _plan(scan: Scan, view: FirstView, look: Look, case: Case) -> tuple[Update, list[Refinement]]:
+    planned = plan_update(scan, view.state, look, case.codec, quick=case.quick)
     refinements = [coded.refinement(1, seq + 2, look.request) for seq, coded in enumerate(planned.coded)]
     for refinement in refinements:
         refinement.to_bytes()
