@@ -17,7 +17,7 @@ from protocol.errors import PortLost
 from simulators.faults import Unplugged
 
 _READ_BYTES = 65536
-_PORTION_BYTES = 4096
+PORTION_BYTES = 4096  # handed to the line at once
 _BITS_PER_BYTE = 10  # start, eight data, stop
 _CATCH_UP_S = 0.02  # a sleep that came back late may be made good up to this
 
@@ -45,6 +45,30 @@ class Device(Protocol):
 
     def wait_s(self, now_s: float) -> float:
         """How long it can do without being stepped. [s]"""
+        ...
+
+
+class ServedPort(Protocol):
+    """The device's end of a carrier: a PtyPort, a UsbTestbed, a UsbDouble."""
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """What the node wrote; b"" when the time is over or `cancel` was called."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`."""
+        ...
+
+    def hang_up(self) -> None:
+        """Pull the plug."""
+        ...
+
+    def plug_in(self) -> None:
+        """Put it in again."""
+        ...
+
+    def cancel(self) -> None:
+        """Wake whoever reads or writes."""
         ...
 
 
@@ -211,7 +235,7 @@ class PtyPort:
             time.sleep(self._free_s - now_s)
 
 
-def serve(scanner: Device, port: PtyPort, stop: threading.Event) -> None:
+def serve(scanner: Device, port: ServedPort, stop: threading.Event, portion_bytes: int = PORTION_BYTES) -> None:
     """Run a scanner on a port until `stop` is set (and the port's `cancel` called, to be heard at once)."""
     while not stop.is_set():
         now_s = time.monotonic()
@@ -221,7 +245,7 @@ def serve(scanner: Device, port: PtyPort, stop: threading.Event) -> None:
             scanner.receive_data(data, now_s)
         scanner.step(now_s)
         try:
-            _write(port, scanner.data_to_send(_PORTION_BYTES), scanner.portion_bytes or _PORTION_BYTES)
+            _write(port, scanner.data_to_send(portion_bytes), scanner.portion_bytes or portion_bytes)
         except Unplugged as pulled:
             port.write(pulled.data)
             port.hang_up()
@@ -229,7 +253,7 @@ def serve(scanner: Device, port: PtyPort, stop: threading.Event) -> None:
             port.plug_in()
 
 
-def _write(port: PtyPort, data: bytes, portion_bytes: int) -> None:
+def _write(port: ServedPort, data: bytes, portion_bytes: int) -> None:
     for at in range(0, len(data), portion_bytes):
         port.write(data[at : at + portion_bytes])
 

@@ -35,7 +35,7 @@ class Faults:
 
     loss, flip, burst : frames that lose bytes, get a bit turned, or are followed by noise.    truncate, lie, twice,
     reorder : frames to the node that stop early, name a wrong length, come twice, or come behind later ones (the last
-    two only columns).    dribble : 1 delivers byte by byte.    stall : seconds that the line once falls silent.
+    two only columns).    dribble : most bytes that arrive at once.    stall : seconds that the line once falls silent.
     reset : 1 makes the device start anew once.    unplug : seconds that the plug is out once, from the middle of a
     column on.    minor, major : 1 makes the device speak a newer minor or another major version.
     """
@@ -115,7 +115,7 @@ class FaultyScanner:
         self._rng = np.random.default_rng(seed)
         self._boots = 1
         self.device = boot(self._boots)
-        self.portion_bytes = 1 if faults.dribble else None
+        self.portion_bytes = int(faults.dribble) or None
         self._mishap_in = -1  # columns to go until the one mishap; below 0 it is not known yet
         self._silent_until_s = 0.0
         self._delayed = b""

@@ -5,6 +5,7 @@ In memory, time is the carrier's own and nothing waits; on a pty or USB a thread
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -14,27 +15,34 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pytest
 
 from drivers.port import Port
 from drivers.scanner import Scanner, ScannerConfig, SweepEvent, SweepFinished, SweepInterrupted, SweepStarted
 from drivers.serial_port import SerialPort
 from drivers.sweep import SweepReport
+from drivers.usb_port import UsbAddress, UsbPort
 from node.assemble import Assembler, Assembly
 from node.journal import Interrupted, Journal, Journals
 from node.resume import add_column, encoder_of
 from protocol.errors import DriverError, PortLost
+from protocol.framing import USB_PAYLOAD_MAX
 from protocol.grid import Grid, GridSpec
 from protocol.scanner_messages import Column, DeviceInfo, Order, RangeColumn, SweepRequest, TextureColumn
-from simulators.carriers import MemoryPort, PtyPort, serve
+from simulators.carriers import MemoryPort, PtyPort, ServedPort, serve
 from simulators.faults import FaultyScanner, parse_faults
 from simulators.scanner import SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.turntable import Turntable
+from simulators.usb_descriptors import UsbIdentity
+from simulators.usb_double import UsbDouble
+from simulators.usb_testbed import UsbTestbed, is_under_preload
 
 SPEC = GridSpec(48, 520, 96, 360, 0.01, 0.5)  # two pieces in each column, on serial
 OVERLAP = 64
 REQUEST = SweepRequest(overlap=OVERLAP)
 PLUG_INS_MAX = 8
+USB_CONFIG = ScannerConfig(quiet_s=0.8, payload_max=USB_PAYLOAD_MAX, window_bytes=1 << 20)
 
 Kind = Literal["scan", "interrupted", "refused"]
 
@@ -60,7 +68,7 @@ class Bench:
     jitter_counts: float = 0.0
     specimen: Specimen = field(default_factory=bumpy)
     serial_number: str = "SIM-0001"
-    turn_s: float = 0.3
+    turn_s: float = 0.1
     order: Order = Order.LIVE
     retention_columns: int = 65535
     payload_max: int = 1024
@@ -109,17 +117,46 @@ def memory(bench: Bench) -> Iterator[Line]:
 @contextmanager
 def pty(bench: Bench) -> Iterator[Line]:
     """A pseudo terminal as fast as the machine allows, served by a thread."""
-    path, stop = bench.folder / f"{bench.serial_number}.tty", threading.Event()
-    with closing(PtyPort(path, 100_000_000)) as port:
-        thread = threading.Thread(target=serve, args=(bench.scanner(), port, stop))
-        thread.start()
-        try:
-            yield Line(lambda: SerialPort(str(path)), time.monotonic, time.sleep, ScannerConfig(quiet_s=0.8))
-        finally:
-            stop.set()
-            port.cancel()
-            thread.join(20)
-            assert not thread.is_alive()
+    path = bench.folder / f"{bench.serial_number}.tty"
+    with closing(PtyPort(path, 100_000_000)) as port, _served(bench, port):
+        yield Line(lambda: SerialPort(str(path)), time.monotonic, time.sleep, ScannerConfig(quiet_s=0.8))
+
+
+@contextmanager
+def usb_double(bench: Bench) -> Iterator[Line]:
+    """The driver for USB on a double of pyusb's backend."""
+    double = UsbDouble(UsbIdentity(serial_number=bench.serial_number))
+    with _served(replace(bench, payload_max=USB_PAYLOAD_MAX), double):
+        address = UsbAddress(double.identity.vendor, double.identity.product, bench.serial_number)
+        yield Line(lambda: UsbPort(address, double), time.monotonic, time.sleep, USB_CONFIG)
+
+
+@contextmanager
+def usb(bench: Bench) -> Iterator[Line]:
+    """The driver for USB on the real libusb, with an emulated device; only under umockdev's preload."""
+    if not is_under_preload():
+        pytest.skip("needs umockdev's preload: tests/system/test_usb.py runs this under it")
+    if bench.faults == "dribble=1":  # every transfer costs the emulation a millisecond
+        bench = replace(bench, faults="dribble=100")
+    bed = UsbTestbed(Path(os.environ["UMOCKDEV_DIR"]), UsbIdentity(serial_number=bench.serial_number))
+    with closing(bed), _served(replace(bench, payload_max=USB_PAYLOAD_MAX), bed):
+        address = UsbAddress.parse(bed.identity.address)
+        yield Line(lambda: UsbPort(address), time.monotonic, time.sleep, USB_CONFIG)
+
+
+@contextmanager
+def _served(bench: Bench, port: ServedPort) -> Iterator[None]:
+    """A thread that runs the scanner at the far end of a line."""
+    stop = threading.Event()
+    thread = threading.Thread(target=serve, args=(bench.scanner(), port, stop))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        port.cancel()
+        thread.join(20)
+        assert not thread.is_alive()
 
 
 @dataclass

@@ -1,0 +1,266 @@
+"""A scanner as a bare USB device, as a Port: bulk transfers by pyusb and libusb, the same frames as on serial.
+
+A thread keeps a large read pending, so that the device never waits for the node's program to come round; what arrived
+waits in memory, at most a few reads of it, then the device has to wait. Packet boundaries mean nothing: frames say
+where they end.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+import threading
+from array import array
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any
+
+import usb.backend.libusb1
+import usb.core
+import usb.util
+
+from protocol.errors import PortLost
+
+READ_BYTES = 262_144
+_WAITING_BYTES_MAX = 4 * READ_BYTES
+_READ_MS = 100  # how long a thread that shall end may go on waiting
+_WRITE_MS = 2000
+_STALLS_MAX = 5  # in a row
+_ADDRESS = re.compile("usb:([0-9a-fA-F]{1,4}):([0-9a-fA-F]{1,4})(?::(.+))?")
+_RULE = (
+    'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{:04x}", ATTR{{idProduct}}=="{:04x}", MODE="0660", GROUP="foveascan"'
+    " in /etc/udev/rules.d/70-foveascan.rules"
+)
+_GONE = (usb.core.USBError, NotImplementedError, ValueError)
+
+
+@dataclass(frozen=True, slots=True)
+class UsbAddress:
+    """Which device: vendor and product id, and a serial number where there may be several."""
+
+    vendor: int
+    product: int
+    serial_number: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> UsbAddress:
+        """From "usb:VID:PID" or "usb:VID:PID:SERIAL", ids in hexadecimal. Raises ValueError."""
+        match = _ADDRESS.fullmatch(text)
+        if match is None:
+            raise ValueError(f"{text!r} is not usb:VENDOR:PRODUCT or usb:VENDOR:PRODUCT:SERIAL, ids in hexadecimal")
+        return cls(int(match[1], 16), int(match[2], 16), match[3])
+
+    def __str__(self) -> str:
+        tail = f":{self.serial_number}" if self.serial_number else ""
+        return f"usb:{self.vendor:04x}:{self.product:04x}{tail}"
+
+
+class UsbPort:
+    """An open USB device; nobody else can use its interface meanwhile.
+
+    backend : pyusb's, another one for tests; by default libusb's.
+    Raises PortLost when there is no such device, no permission, or somebody else uses it, naming the cure.
+    """
+
+    def __init__(self, address: UsbAddress, backend: Any = None) -> None:
+        self._address = address
+        self._arrived: deque[bytes] = deque()
+        self._arrived_bytes = 0
+        self._changed = threading.Condition()
+        self._is_cancelled = False
+        self._is_closed = False
+        self._lost: str | None = None
+        self._detached: int | None = None
+        self._device = _find(address, backend)
+        with self._translated("open"):
+            self._interface, self._source, self._sink = self._claim()
+        self._reader = threading.Thread(target=self._pump, name=f"read {address}", daemon=True)
+        self._reader.start()
+
+    @property
+    def name(self) -> str:
+        """The address it was opened by."""
+        return str(self._address)
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """As Port.read."""
+        with self._changed:
+            self._changed.wait_for(self._has_news, max(timeout_s, 0.0))
+            self._is_cancelled, was_cancelled = False, self._is_cancelled
+            if not self._arrived and not was_cancelled:
+                self._check()
+            return self._take(max_bytes) if self._arrived else b""
+
+    def write(self, data: bytes) -> None:
+        """As Port.write; a device that takes nothing for two seconds is lost."""
+        self._check()
+        with self._translated("write"):
+            rest, stalls = memoryview(data), 0
+            while rest:
+                try:
+                    rest = rest[self._sink.write(rest, _WRITE_MS) :]
+                except usb.core.USBError as error:
+                    stalls += 1
+                    if error.errno != errno.EPIPE or stalls > _STALLS_MAX:
+                        raise
+                    self._sink.clear_halt()
+
+    def cancel(self) -> None:
+        """As Port.cancel."""
+        with self._changed:
+            self._is_cancelled = True
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """As Port.close."""
+        with self._changed:
+            if self._is_closed:
+                return
+            self._is_closed = True
+            self._changed.notify_all()
+        self._reader.join()
+        with suppress(*_GONE):
+            usb.util.release_interface(self._device, self._interface)
+        with suppress(*_GONE):
+            if self._detached is not None:
+                self._device.attach_kernel_driver(self._detached)
+        with suppress(*_GONE):
+            usb.util.dispose_resources(self._device)
+
+    # -- the reading thread --------------------------------------------------------------------------------------
+
+    def _pump(self) -> None:
+        """Keep a read pending until the port is closed or the device gone."""
+        buffer, stalls = array("B", bytes(READ_BYTES)), 0
+        view = memoryview(buffer)
+        while self._lost is None and self._waits_for_room():
+            try:
+                size = self._source.read(buffer, _READ_MS)
+            except usb.core.USBTimeoutError:
+                continue
+            except usb.core.USBError as error:
+                stalls += 1
+                if error.errno != errno.EPIPE or stalls > _STALLS_MAX or not self._clear_halt():
+                    self._lose(f"read failed: {error}")
+                continue
+            stalls = 0
+            if size:
+                self._put(bytes(view[:size]))
+
+    def _clear_halt(self) -> bool:
+        """Make a stalled endpoint go on; False when the device is gone."""
+        try:
+            self._source.clear_halt()
+        except usb.core.USBError:
+            return False
+        return True
+
+    def _waits_for_room(self) -> bool:
+        """Wait while more has arrived than anybody fetched; False when the port is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_closed or self._arrived_bytes < _WAITING_BYTES_MAX)
+            return not self._is_closed
+
+    def _put(self, data: bytes) -> None:
+        with self._changed:
+            self._arrived.append(data)
+            self._arrived_bytes += len(data)
+            self._changed.notify_all()
+
+    def _lose(self, why: str) -> None:
+        with self._changed:
+            self._lost = self._lost or why
+            self._changed.notify_all()
+
+    # -- the reader of the port ----------------------------------------------------------------------------------
+
+    def _has_news(self) -> bool:
+        return bool(self._arrived or self._is_cancelled or self._lost or self._is_closed)
+
+    def _take(self, max_bytes: int) -> bytes:
+        data = self._arrived.popleft()
+        if len(data) > max_bytes:
+            self._arrived.appendleft(data[max_bytes:])
+            data = data[:max_bytes]
+        self._arrived_bytes -= len(data)
+        self._changed.notify_all()
+        return data
+
+    def _check(self) -> None:
+        if self._is_closed or self._lost:
+            raise PortLost(f"{self._address}: {self._lost or 'the port is closed'}")
+
+    @contextmanager
+    def _translated(self, doing: str) -> Iterator[None]:
+        """Turn what libusb says into PortLost, for good."""
+        try:
+            yield
+        except _GONE as error:
+            self._lose(f"{doing} failed: {_in_words(error, self._address)}")
+            raise PortLost(f"{self._address}: {self._lost}") from error
+
+    def _claim(self) -> tuple[int, Any, Any]:
+        """The first interface with bulk endpoints both ways, claimed: its number, and the endpoints in and out."""
+        try:
+            configuration = self._device.get_active_configuration()
+        except usb.core.USBError:
+            self._device.set_configuration()
+            configuration = self._device.get_active_configuration()
+        for interface in configuration:
+            ends = [_bulk(interface, direction) for direction in (usb.util.ENDPOINT_IN, usb.util.ENDPOINT_OUT)]
+            if all(ends):
+                number = interface.bInterfaceNumber
+                self._detach(number)
+                usb.util.claim_interface(self._device, number)
+                return number, *ends
+        raise ValueError("it has no interface with bulk endpoints both ways, so it is no scanner of this kind")
+
+    def _detach(self, interface: int) -> None:
+        """Have the kernel's own driver let go of an interface, if it has one; it gets it back at the end."""
+        with suppress(NotImplementedError):
+            if self._device.is_kernel_driver_active(interface):
+                self._device.detach_kernel_driver(interface)
+                self._detached = interface
+
+
+def _find(address: UsbAddress, backend: Any) -> Any:
+    """The device at an address. Raises PortLost."""
+    backend = backend or usb.backend.libusb1.get_backend()
+    if backend is None:
+        raise PortLost(f"{address}: libusb is not installed; as root: apt-get install libusb-1.0-0")
+    try:
+        found = list(usb.core.find(True, backend=backend, idVendor=address.vendor, idProduct=address.product))
+        chosen = [device for device in found if _has_serial(device, address.serial_number)]
+    except _GONE as error:
+        raise PortLost(f"{address}: {_in_words(error, address)}") from error
+    if not chosen:
+        others = f"; {len(found)} of this kind with other serial numbers are" if found else ""
+        raise PortLost(f"{address}: no such device is connected{others}")
+    return chosen[0]
+
+
+def _has_serial(device: Any, wanted: str | None) -> bool:
+    return wanted is None or device.serial_number == wanted
+
+
+def _bulk(interface: Any, direction: int) -> Any:
+    """The first bulk endpoint of an interface in one direction, or None."""
+    return usb.util.find_descriptor(
+        interface,
+        custom_match=lambda end: (
+            usb.util.endpoint_direction(end.bEndpointAddress) == direction
+            and usb.util.endpoint_type(end.bmAttributes) == usb.util.ENDPOINT_TYPE_BULK
+        ),
+    )
+
+
+def _in_words(error: Exception, address: UsbAddress) -> str:
+    """What libusb said, with its cure where there is one."""
+    number = getattr(error, "errno", None)
+    if number == errno.EACCES or "langid" in str(error):  # pyusb's words for strings it may not read
+        return f"no permission; add the udev rule {_RULE.format(address.vendor, address.product)} and plug it in again"
+    if number == errno.EBUSY:
+        return "another program uses it"
+    return str(error)

@@ -1,0 +1,413 @@
+"""A USB device that the real libusb talks to, without a kernel's help: the device's side of libumockdev's preload.
+
+A program started with `environment` sees one USB device: sysfs and device nodes are files under `root`, its ioctls
+come here over a Unix socket, and plugging shows as a udev event. What a carrier writes goes out as bulk packets: a read
+ends when it is full, or with a packet that is not (one of length zero if need be), as on a kernel.
+
+The preload's messages are three u64 (kind, two arguments) and data: 1 ioctl(request, address), 3 done(result, errno),
+5 read(address, size), 6 write(address, size). Source: umockdev's ioctl_tree protocol, checked against a kernel's gadget.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from simulators.usb_descriptors import BULK_IN, BULK_OUT, UsbIdentity
+from simulators.usb_uevent import announce
+
+PRELOAD = "libumockdev-preload.so.0"
+_HOLD_S = 0.002  # how long a reap waits for news: longer holds up writes, shorter spins
+_CATCH_UP_S = 0.02
+_OUT_WAITING_BYTES = 1 << 20
+_MESSAGE = struct.Struct("<QQQ")
+_IOCTL, _DONE, _READ, _WRITE = 1, 3, 5, 6
+_MINUS_1 = (1 << 64) - 1
+_NOT_MINE = (1 << 64) - 100  # the preload then does the real thing
+_URB = struct.Struct("<BBxxiIxxxxQiiiiIIQ")
+_STATUS_AT, _ACTUAL_AT = 4, 28
+_TYPE_CONTROL = 2
+_SETUP = struct.Struct("<BBHHH")
+_CAPABILITIES = 0x1F
+
+_REAP = {0x4008550D, 0x4008550C}
+_SUBMIT, _DISCARD, _GET_CAPABILITIES = 0x8038550A, 0x550B, 0x8004551A
+_GET_DRIVER, _GET_SPEED = 0x41045508, 0x551F
+_CLEAR_HALT = 0x80045515
+_CLAIM, _RELEASE = 0x8004550F, 0x80045510
+_ACCEPTED = {_CLAIM, _RELEASE, _CLEAR_HALT, 0x80045505, 0x80085504, 0x5514}
+_HIGH_SPEED = 3
+
+
+@dataclass(slots=True)
+class _Urb:
+    """A transfer that the program has handed over: where it lies in its memory, and what became of it."""
+
+    address: int
+    buffer: int
+    size: int
+    data: bytes | memoryview = b""
+    status: int = 0
+    actual: int = 0
+
+
+@dataclass(slots=True)
+class _Plugged:
+    """The device from one plugging in to the next pulling out; a program may hold on to it beyond that."""
+
+    number: int
+    is_gone: bool = False
+    is_halted: bool = False
+    claimed_by: object = None
+    pending: deque[_Urb] = field(default_factory=deque)
+    done: deque[_Urb] = field(default_factory=deque)
+
+    def fail_pending(self) -> None:
+        """What a kernel does with the transfers of a device that is gone."""
+        while self.pending:
+            urb = self.pending.popleft()
+            urb.status = -errno.ESHUTDOWN
+            self.done.append(urb)
+
+
+class UsbTestbed:
+    """One simulated USB device under a folder, as a carrier's port: `read` and `write` are the device's end.
+
+    rate_bytes_s : speed towards the node.   Other files under `root` (udev's sockets) are left alone.
+    """
+
+    def __init__(self, root: Path, identity: UsbIdentity | None = None, rate_bytes_s: float = float("inf")) -> None:
+        self.identity = identity or UsbIdentity()
+        self.name = self.identity.address
+        self.stalls = 0  # transfers that the device will refuse next
+        self._root = root
+        self._rate_bytes_s = rate_bytes_s
+        self._free_s = 0.0
+        self._plugged = _Plugged(1, is_gone=True)
+        self._changed = threading.Condition()
+        self._out: deque[memoryview] = deque()
+        self._in: deque[bytes] = deque()
+        self._is_cancelled = False
+        self._listener: socket.socket | None = None
+        (root / "sys/class").mkdir(parents=True, exist_ok=True)
+        self.plug_in()
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What the node's environment needs beside its own."""
+        return {"LD_PRELOAD": PRELOAD, "UMOCKDEV_DIR": str(self._root)}
+
+    # -- the device's end ----------------------------------------------------------------------------------------
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """What the node wrote, one transfer at a time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._in or self._is_cancelled, max(timeout_s, 0.0))
+            self._is_cancelled = False
+            return self._in.popleft() if self._in else b""
+
+    def write(self, data: bytes) -> None:
+        """Send `data` as packets, the last one short; waits while the node does not fetch them, until `cancel`."""
+        if not data:
+            return
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting_bytes() < _OUT_WAITING_BYTES or self._is_cancelled)
+            self._out.append(memoryview(data))
+            self._fill()
+        self._pace(len(data))
+
+    def cancel(self) -> None:
+        """Wake who waits in read or write."""
+        with self._changed:
+            self._is_cancelled = True
+            self._changed.notify_all()
+
+    def hang_up(self) -> None:
+        """Pull the plug: every pending transfer ends with ESHUTDOWN."""
+        with self._changed:
+            self._plugged.is_gone = True
+            self._plugged.fail_pending()
+            self._out.clear()
+            self._in.clear()
+            self._changed.notify_all()
+        announce(self._root, "remove", self._properties())
+        self._sysfs_link.unlink()
+        shutil.rmtree(self._sysfs)
+        self._node.unlink()
+
+    def plug_in(self) -> None:
+        """Put the plug in: a device of the next number appears."""
+        if self._listener is not None:
+            self._listener.close()
+            self._ioctls.unlink()
+        with self._changed:
+            self._plugged = _Plugged(self._plugged.number + 1)
+        self._ioctls.parent.mkdir(parents=True, exist_ok=True)
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(self._ioctls))
+        self._listener.listen(8)
+        threading.Thread(target=self._accept, args=(self._listener, self._plugged), daemon=True).start()
+        self._make_sysfs()
+        announce(self._root, "add", self._properties())
+
+    def close(self) -> None:
+        """Unplug for good."""
+        if not self._plugged.is_gone:
+            self.hang_up()
+        if self._listener is not None:
+            self._listener.close()
+        self._ioctls.unlink(missing_ok=True)
+
+    def _waiting_bytes(self) -> int:
+        return sum(map(len, self._out))
+
+    def _pace(self, size_bytes: int) -> None:
+        """Sleep as long as the line needs for that many bytes."""
+        now_s = time.monotonic()
+        self._free_s = max(self._free_s, now_s - _CATCH_UP_S) + size_bytes / self._rate_bytes_s
+        if self._free_s > now_s:
+            time.sleep(self._free_s - now_s)
+
+    # -- sysfs ---------------------------------------------------------------------------------------------------
+
+    @property
+    def _device_path(self) -> str:
+        return f"/dev/bus/usb/001/{self._plugged.number:03d}"
+
+    @property
+    def _sysfs(self) -> Path:
+        return self._root / "sys/devices/pci0000:00/usb1/1-1"
+
+    @property
+    def _sysfs_link(self) -> Path:
+        return self._root / "sys/bus/usb/devices/1-1"
+
+    @property
+    def _ioctls(self) -> Path:
+        return self._root / f"ioctl{self._device_path}"
+
+    @property
+    def _node(self) -> Path:
+        return Path(f"{self._root}{self._device_path}")
+
+    def _make_sysfs(self) -> None:
+        ids = self.identity
+        for folder in (self._sysfs, self._sysfs_link.parent, self._node.parent):
+            folder.mkdir(parents=True, exist_ok=True)
+        texts = {
+            "busnum": "1", "devnum": f"{self._plugged.number}", "speed": "480", "bConfigurationValue": "1",
+            "idVendor": f"{ids.vendor:04x}", "idProduct": f"{ids.product:04x}", "serial": ids.serial_number,
+            "manufacturer": ids.manufacturer, "product": ids.model, "bNumInterfaces": "1",
+            "uevent": "\n".join(f"{key}={value}" for key, value in self._properties().items()),
+        }  # fmt: skip
+        for name, text in texts.items():
+            (self._sysfs / name).write_text(text + "\n")
+        (self._sysfs / "descriptors").write_bytes(ids.device_descriptor() + ids.configuration_descriptor())
+        (self._sysfs / "subsystem").symlink_to("../../../../bus/usb")
+        self._sysfs_link.symlink_to("../../../devices/pci0000:00/usb1/1-1")
+        self._node.touch()
+
+    def _properties(self) -> dict[str, str]:
+        """As udev tells them."""
+        return {
+            "DEVPATH": "/devices/pci0000:00/usb1/1-1", "SUBSYSTEM": "usb", "DEVNAME": self._device_path,
+            "DEVTYPE": "usb_device", "DRIVER": "usb", "BUSNUM": "001", "DEVNUM": f"{self._plugged.number:03d}",
+            "MAJOR": "189", "MINOR": f"{self._plugged.number - 1}",
+        }  # fmt: skip
+
+    # -- the program's ioctls ------------------------------------------------------------------------------------
+
+    def _accept(self, listener: socket.socket, plugged: _Plugged) -> None:
+        with suppress(OSError):  # closed
+            while True:
+                connection, _ = listener.accept()
+                threading.Thread(target=self._serve, args=(connection, plugged), daemon=True).start()
+
+    def _serve(self, connection: socket.socket, plugged: _Plugged) -> None:
+        """Answer one open device file of the program, until it closes it."""
+        client = _Client(connection)
+        try:
+            for request, address in client.ioctls():
+                self._answer(client, plugged, request, address)
+        except (EOFError, OSError):
+            pass
+        finally:
+            with self._changed:
+                if plugged.claimed_by is client:
+                    plugged.claimed_by = None
+                    plugged.pending.clear()
+            connection.close()
+
+    def _answer(self, client: _Client, plugged: _Plugged, request: int, address: int) -> None:
+        if request in _REAP:
+            self._reap(client, plugged, address)
+        elif plugged.is_gone:
+            client.fail(errno.ENODEV)
+        elif request == _SUBMIT:
+            self._submit(client, plugged, address)
+        elif request == _DISCARD:
+            client.done() if self._discard(plugged, address) else client.fail(errno.EINVAL)
+        elif request == _GET_CAPABILITIES:
+            client.done([(address, struct.pack("<I", _CAPABILITIES))])
+        elif request == _GET_DRIVER:
+            client.fail(errno.ENODATA)
+        elif request == _GET_SPEED:
+            client.done(result=_HIGH_SPEED)
+        elif request == _CLAIM and plugged.claimed_by not in (None, client):
+            client.fail(errno.EBUSY)
+        elif request in _ACCEPTED:
+            self._accept_state(client, plugged, request)
+            client.done()
+        else:
+            client.fail(errno.ENOTTY)
+
+    def _accept_state(self, client: _Client, plugged: _Plugged, request: int) -> None:
+        """What a request changes about the device."""
+        if request == _CLAIM:
+            plugged.claimed_by = client
+        elif request == _RELEASE:
+            plugged.claimed_by = None
+        elif request == _CLEAR_HALT:
+            plugged.is_halted = False
+
+    def _reap(self, client: _Client, plugged: _Plugged, address: int) -> None:
+        """Hand over a finished transfer, or say that there is none yet."""
+        with self._changed:
+            if not (plugged.done or plugged.is_gone or client.has_reaped):
+                self._changed.wait_for(lambda: plugged.done or plugged.is_gone, _HOLD_S)
+            urb = plugged.done.popleft() if plugged.done else None
+            client.has_reaped = urb is not None  # libusb then asks for more before it does anything else
+        if urb is None:
+            client.fail(errno.ENODEV if plugged.is_gone else errno.EAGAIN)
+            return
+        outcome: list[tuple[int, bytes | memoryview]] = [(urb.buffer, urb.data)] if len(urb.data) else []
+        outcome.append((urb.address + _STATUS_AT, struct.pack("<i", urb.status)))
+        outcome.append((urb.address + _ACTUAL_AT, struct.pack("<i", urb.actual)))
+        client.done([*outcome, (address, struct.pack("<Q", urb.address))])
+
+    def _submit(self, client: _Client, plugged: _Plugged, address: int) -> None:
+        kind, endpoint, _, _, buffer, size, *_ = _URB.unpack(client.fetch(address, _URB.size))
+        urb = _Urb(address, buffer, size)
+        sent = client.fetch(buffer, size) if kind == _TYPE_CONTROL or endpoint == BULK_OUT else b""
+        with self._changed:
+            if kind == _TYPE_CONTROL:
+                self._control(urb, sent)
+                plugged.done.append(urb)
+            elif self._refuses(plugged):
+                urb.status = -errno.EPIPE
+                plugged.done.append(urb)
+            elif endpoint == BULK_OUT:
+                self._in.append(sent)
+                urb.actual = size
+                plugged.done.append(urb)
+            elif endpoint == BULK_IN:
+                plugged.pending.append(urb)
+                self._fill()
+            if plugged.is_gone:
+                plugged.fail_pending()
+            self._changed.notify_all()
+        client.done()
+
+    def _control(self, urb: _Urb, sent: bytes) -> None:
+        """Strings are told, everything outward is taken, everything else stalls."""
+        kind, request, value, _, size = _SETUP.unpack_from(sent)
+        text = self.identity.string_descriptor(value & 0xFF) if (kind, request, value >> 8) == (0x80, 6, 3) else None
+        if text is not None:
+            urb.data, urb.actual, urb.buffer = text[:size], min(len(text), size), urb.buffer + _SETUP.size
+        elif kind & 0x80:
+            urb.status = -errno.EPIPE
+        else:
+            urb.actual = size
+
+    def _refuses(self, plugged: _Plugged) -> bool:
+        """Whether the endpoints are halted, or halt now."""
+        if self.stalls:
+            self.stalls -= 1
+            plugged.is_halted = True
+        return plugged.is_halted
+
+    def _fill(self) -> None:
+        """Complete pending reads with what waits: each with the rest of one write, or as much as it has room for."""
+        plugged = self._plugged
+        while plugged.pending and self._out:
+            urb, data = plugged.pending.popleft(), self._out.popleft()
+            urb.data = data[: urb.size]
+            urb.actual = len(urb.data)
+            if len(data) > urb.size:
+                self._out.appendleft(data[urb.size :])
+            plugged.done.append(urb)
+        self._changed.notify_all()
+
+    def _discard(self, plugged: _Plugged, address: int) -> bool:
+        """The program gives a transfer up."""
+        with self._changed:
+            for urb in plugged.pending:
+                if urb.address == address:
+                    plugged.pending.remove(urb)
+                    urb.status = -errno.ENOENT
+                    plugged.done.append(urb)
+                    self._changed.notify_all()
+                    return True
+        return False
+
+
+class _Client:
+    """The preload library at the other end of a socket: its ioctls come, its memory is read and written."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self.has_reaped = False
+
+    def ioctls(self) -> Iterator[tuple[int, int]]:
+        """(request, address of the argument) of each ioctl, which wants `done` or `fail`; EOFError at the end."""
+        while True:
+            kind, request, address = _MESSAGE.unpack(self._receive(_MESSAGE.size))
+            if kind == _IOCTL:
+                yield request & 0xFFFFFFFF, address
+            else:
+                self._connection.sendall(_MESSAGE.pack(_DONE, _NOT_MINE, 0))
+
+    def fetch(self, address: int, size: int) -> bytes:
+        """Bytes of the program's memory."""
+        self._connection.sendall(_MESSAGE.pack(_READ, address, size))
+        return self._receive(size)
+
+    def done(self, writes: list[tuple[int, bytes | memoryview]] | None = None, result: int = 0) -> None:
+        """The ioctl succeeded, after these bytes are written to these addresses."""
+        parts: list[bytes | memoryview] = []
+        for address, data in writes or []:
+            parts += (_MESSAGE.pack(_WRITE, address, len(data)), data)
+        parts.append(_MESSAGE.pack(_DONE, result, 0))
+        for part in parts if sum(map(len, parts)) > 1 << 16 else [b"".join(parts)]:
+            self._connection.sendall(part)
+
+    def fail(self, number: int) -> None:
+        """The ioctl failed."""
+        self._connection.sendall(_MESSAGE.pack(_DONE, _MINUS_1, number))
+
+    def _receive(self, size: int) -> bytes:
+        data = self._connection.recv(size, socket.MSG_WAITALL)
+        if len(data) < size:
+            raise EOFError
+        return data
+
+
+def is_available() -> bool:
+    """Whether this machine has the preload library."""
+    folders = (Path(folder) for folder in ("/lib", "/usr/lib", "/usr/local/lib", "/usr/lib64"))
+    return any(any(folder.glob(f"**/{PRELOAD}")) for folder in folders if folder.is_dir())
+
+
+def is_under_preload() -> bool:
+    """Whether this very process sees a testbed instead of real USB."""
+    return "UMOCKDEV_DIR" in os.environ and PRELOAD in os.environ.get("LD_PRELOAD", "")
