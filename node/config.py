@@ -52,7 +52,6 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
     listen: Annotated[str, Meta(max_length=300)] = "127.0.0.1:7345"  # HOST:PORT or [IPv6]:PORT; port 0: any free one
     insecure: bool = False  # plain HTTP without login, on loopback only
     max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
-    client_queue: Annotated[int, Meta(ge=1, le=256)] = 8  # messages waiting for one client
     shared_cache: bool = False  # let caches in between keep foveae, for a day at most: only where they are yours
     encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode
 
@@ -93,11 +92,8 @@ class FirstView(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Planner(Struct, frozen=True, forbid_unknown_fields=True):
-    """[planner]: what an update aims at where the client names nothing."""
+    """[planner]: what an update may take."""
 
-    window: Annotated[float, Meta(gt=0, le=1)] = 0.05  # share of the area round the click
-    texture_db: Annotated[float, Meta(ge=10, le=80)] = 40.0  # PSNR to reach in the window
-    range_mm: Annotated[float, Meta(ge=1e-4, le=100)] = 0.1  # 99th percentile of the range error to reach in the window
     cold_start_bytes_s: Annotated[float, Meta(ge=1e3, le=1e9)] = 1e6  # bandwidth assumed until acknowledgements tell
 
 

@@ -24,9 +24,9 @@ def test_the_defaults_lie_within_their_own_bounds() -> None:
 
 
 def test_a_file_sets_what_it_names_and_leaves_the_rest(tmp_path: Path) -> None:
-    path = written(tmp_path, '[capture]\nscanner = "/dev/ttyACM0"\nbaud = 115200\n[planner]\nwindow = 1\n')
+    path = written(tmp_path, '[capture]\nscanner = "/dev/ttyACM0"\nbaud = 115200\n[first_view]\nmax_bytes = 2048\n')
     config = load_config(path)
-    assert (config.capture.scanner, config.capture.baud, config.planner.window) == ("/dev/ttyACM0", 115200, 1.0)
+    assert (config.capture.scanner, config.capture.baud, config.first_view.max_bytes) == ("/dev/ttyACM0", 115200, 2048)
     assert (config.capture.stale_s, config.server) == (2.0, Server())
 
 
@@ -55,7 +55,7 @@ def test_an_override_mends_a_file_that_would_be_refused_without_it(tmp_path: Pat
         ("[capture]\nbauds = 1", "capture.bauds: unknown key; known here: scanner, baud, stale_s"),
         ("[cap]\nbaud = 1", "cap: unknown key; known here: capture, server, library, first_view, planner, discovery"),
         ("capture = 3", "capture: expected a table, got int"),
-        ("[planner]\nwindow = 0", "planner.window: expected float > 0.0"),
+        ("[planner]\ncold_start_bytes_s = 0", "planner.cold_start_bytes_s: expected float >= 1000.0"),
         ('[server]\ninsecure = "yes"', "server.insecure: expected bool, got str"),
         ('[server]\nlisten = "7345"', "server.listen: expected HOST:PORT or [IPv6]:PORT, got '7345'"),
         ('[server]\nlisten = "a:65536"', "server.listen: expected HOST:PORT or [IPv6]:PORT, got 'a:65536'"),
