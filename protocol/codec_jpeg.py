@@ -13,6 +13,7 @@ A sender cannot lie about a size in headers that it does not write.
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 
 import cv2
 import imagecodecs
@@ -77,6 +78,7 @@ def frame_header(shape: tuple[int, int], jpeg_q: int) -> bytes:
     ))
 
 
+@lru_cache(maxsize=256)
 def quantisation(base: bytes, jpeg_q: int) -> bytes:
     """A table of Annex K (64 bytes, zigzag) scaled to Q 1..100 by the Independent JPEG Group's rule."""
     scale = 5000 // jpeg_q if jpeg_q < 50 else 200 - 2 * jpeg_q

@@ -106,7 +106,7 @@ def select(lattice: Lattice, held: ChannelHoldings, rank: int) -> tuple[Selectio
 def _window(axis: Axis, begin: int, end: int) -> Window:
     begin_at, end_at = int(axis.first[begin]), int(axis.last[end - 1]) + 1
     at = axis.at[begin_at:end_at]
-    sample, local = np.unique(axis.sample[begin_at:end_at], return_inverse=True)
+    sample, local = _numbered(axis.sample[begin_at:end_at])
     start = int(axis.start[begin])
     position = QUARTERS * np.arange(start, int(axis.stop[end - 1]), dtype=np.int64)
     if at.size == 1:
@@ -120,6 +120,14 @@ def _window(axis: Axis, begin: int, end: int) -> Window:
     return Window(axis.block[begin:end], size, start, sample, low, high, part, whole)
 
 
+def _numbered(sample: IntArray) -> tuple[IntArray, IntArray]:
+    """Samples once each, ascending, and for each given one its place among them."""
+    if sample[-1] - sample[0] == sample.size - 1 and np.all(np.diff(sample) == 1):  # nearly always: a run of them
+        return sample, sample - sample[0]
+    once, place = np.unique(sample, return_inverse=True)
+    return once, place
+
+
 def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
     """Dense range of the windows' rectangle from the transmitted samples, by integer bilinear interpolation.
 
@@ -130,7 +138,7 @@ def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
     y, x = selection.y, selection.x
     _check_samples(selection, range_steps.shape)
     columns = _blend(range_steps.T.astype(np.float64), x).T
-    return _round_ratio(_blend(columns, y), (y.whole[:, None] * x.whole[None, :]).astype(np.float64))
+    return _round_ratio(_blend(columns, y), np.multiply.outer(y.whole.astype(np.float64), x.whole))
 
 
 def _blend(samples: FloatArray, window: Window) -> FloatArray:
