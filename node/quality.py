@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from node.coded import Coded
-from node.texture_model import Expected
+from node.texture_model import MSE_MIN, Expected
 
 MARGIN = 0.98  # of the squared error allowed: what is aimed at
 OVERSHOOT_DB = 0.45  # a result so little above the target is not worth another encode: a step of quality is 0.35 dB
@@ -66,10 +66,10 @@ class QualitySearch:
         if done or ((reached or self.limited) and len(self._tried) >= TRIES):
             self._next = None
             return
-        worse = point.mse / self._expected.mse(point.quality)
+        worse = max(point.mse, MSE_MIN) / self._expected.mse(point.quality)  # a plain texture leaves no error at all
         self._aim(worse, point.coded.wire_bytes / self._expected.size_bytes(point.quality))
         if self._next in self._tried:
-            self._next = None if reached or self.limited else min(point.quality + 1, self._highest)
+            self._next = None if reached or self.limited else self._above(point.quality)
 
     def at_least(self, quality: int) -> None:
         """Less than this leaves blocks as they are that spoil the result."""
@@ -95,6 +95,11 @@ class QualitySearch:
         if reached:
             return min(reached, key=lambda point: point.coded.wire_bytes)
         return min(self._points, key=lambda point: point.mse, default=None)
+
+    def _above(self, quality: int) -> int:
+        """What to try after a quality that is too low: half way to the lowest that is not, where one is known."""
+        enough = min((point.quality for point in self._points if point.mse <= self._target), default=None)
+        return min(quality + 1, self._highest) if enough is None else (quality + enough) // 2
 
     def _aim(self, worse: float, larger: float) -> None:
         """Choose the next quality, given how far the expectation was off: factors on squared error and bytes."""

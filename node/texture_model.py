@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from protocol.codec import TextureCodec, decode_texture, encode_texture
+from protocol.codec import LOSSLESS, TextureCodec, decode_texture, encode_texture
 from protocol.grid import FloatArray, ImageArray, IntArray
 from protocol.region import Region
 
@@ -40,7 +40,7 @@ class Expected:
 
     def mse(self, quality: float) -> float:
         """Squared error per value at a quality."""
-        return float(np.exp(np.interp(quality, QUALITIES, self.log_mse)))
+        return float(np.exp(_extended(quality, self.log_mse)))
 
     def size_bytes(self, quality: float) -> float:
         """Payload at a quality."""
@@ -55,7 +55,10 @@ class Expected:
     def quality_for_mse(self, mse: float) -> int:
         """The lowest quality that should leave no more than this error."""
         falling = np.minimum.accumulate(self.log_mse)
-        return int(np.ceil(np.interp(-np.log(max(mse, MSE_MIN)), -falling, QUALITIES)))
+        wanted = np.log(max(mse, MSE_MIN))
+        slope = (falling[-1] - falling[-2]) / (QUALITIES[-1] - QUALITIES[-2])
+        beyond = min((wanted - falling[-1]) / slope, LOSSLESS) if slope < 0 and wanted < falling[-1] else 0
+        return int(np.ceil(np.interp(-wanted, -falling, QUALITIES) + beyond))
 
     def quality_for_bytes(self, size_bytes: float) -> int:
         """The highest quality that should take no more than this."""

@@ -16,7 +16,7 @@ from node.library import Scan
 from node.state import ClientState
 from node.texture_model import TextureModel
 from protocol import messages as m
-from protocol.grid import VOID
+from protocol.grid import VOID, Grid
 from protocol.lattice import Channel
 from protocol.messages import Look, LookParameters, RangeParameters, TextureParameters
 from protocol.refinement import Refinement
@@ -241,3 +241,26 @@ def test_overlapping_windows_reach_their_quality_too(
         viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture))
         assert viewer.range_error_mm(look) <= range_mm
         assert viewer.texture_db(look) >= look.texture_db - 0.01
+
+
+@pytest.mark.parametrize("codec", ["htj2k", "jpeg"])
+@pytest.mark.parametrize("shape", [(160, 96), (8, 8), (1, 100), (360, 1)])
+def test_a_texture_of_one_colour_is_served(tmp_path: Path, codec: m.CodecName, shape: tuple[int, int]) -> None:
+    grid = make_grid(*shape)
+    scan = keep(Grid(grid.spec, grid.range_steps, np.full_like(grid.texture, 128)), tmp_path)
+    viewer = Viewer(scan, build_first_view(scan, codec, 32768))
+    for model in (None, TextureModel(scan.texture)):
+        look = Look(1, 0.5, 0.5)
+        viewer.take(plan_update(scan, viewer.state, look, codec, model=model))
+        assert viewer.texture_db(look) >= 40
+
+
+@pytest.mark.parametrize("target_db", [40, 50, 60])
+def test_noise_reaches_the_quality_asked_for(tmp_path: Path, target_db: float) -> None:
+    grid = make_grid()
+    noise = np.random.default_rng(1).integers(0, 256, grid.texture.shape, np.uint8)
+    scan = keep(Grid(grid.spec, grid.range_steps, noise), tmp_path)
+    viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
+    look = Look(1, 0.5, 0.5, texture_db=target_db)
+    viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=TextureModel(scan.texture)))
+    assert viewer.texture_db(look) >= target_db - 0.01
