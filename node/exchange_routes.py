@@ -54,7 +54,7 @@ class ExchangeRoutes:
     async def _export(self, request: web.Request) -> web.StreamResponse:
         _check_free(self._exporting)
         async with self._exporting:
-            scan_id = self._exhibits.resolve(request.match_info["scan"])
+            scan_id = self._exhibits.library.resolve(request.match_info["scan"])
             suffix = f".{request.match_info['format']}"
             scan = await asyncio.to_thread(self._exhibits.library.open, scan_id)
             with self._temporary() as file:

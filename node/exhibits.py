@@ -43,7 +43,7 @@ class Exhibits:
 
     async def open(self, scan_id: str, codec: CodecName, profile: Profile = "default") -> Opening:
         """A scan ("latest" or an id) and its first view. Raises LibraryError when there is none such."""
-        key: Key = self.resolve(scan_id), codec, profile
+        key: Key = self.library.resolve(scan_id), codec, profile
         future = self._views.get(key)
         if future is None:
             future = asyncio.ensure_future(self.work(lambda: self._build(*key)))
@@ -69,15 +69,6 @@ class Exhibits:
         for key in [key for key in self._views if key[0] == scan_id]:
             del self._views[key]
         self._models.pop(scan_id, None)
-
-    def resolve(self, scan_id: str) -> str:
-        """The id that "latest" stands for; any other is returned as it is. Raises LibraryError when there is none."""
-        if scan_id != "latest":
-            return scan_id
-        scans = self.library.scans()
-        if not scans:
-            raise LibraryError("there is no scan yet: start a sweep")
-        return scans[0].id
 
     async def work(self, job: Callable[[], T]) -> T:
         """Run a job in one of the encoding threads."""

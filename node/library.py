@@ -45,6 +45,7 @@ from protocol.grid import Grid, GridSpec, ImageArray, StepArray
 __all__ = ["About", "Library", "Problem", "Scan", "ScanSummary", "content_id", "survey", "verify"]
 
 OPEN_MAX = 4
+LATEST = "latest"  # stands for the id of the newest scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +129,15 @@ class Library:
         if summary is None:
             raise LibraryError(f"no scan {scan_id[:40]!r} in this library")
         return summary
+
+    def resolve(self, scan_id: str) -> str:
+        """The id that "latest" stands for; any other is returned as it is. Raises LibraryError when there is none."""
+        if scan_id != LATEST:
+            return scan_id
+        scans = self.scans()
+        if not scans:
+            raise LibraryError("there is no scan yet: start a sweep")
+        return scans[0].id
 
     def open(self, scan_id: str) -> Scan:
         """A scan with its samples mapped and checked against its id. Raises LibraryError when unknown or damaged."""

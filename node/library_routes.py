@@ -8,6 +8,9 @@
     POST   /v1/sweeps/{sweep}/resume    go on with one, if the scanner agrees
     GET    /v1/sweeps/{sweep}.npz       what there is of it (node.partial)
     DELETE /v1/sweeps/{sweep}
+
+A scan is named by its id. What only reads takes "latest" too; what changes or deletes a scan does not, since another
+one may be the newest by the time that it is done.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from node.auth import ROLE, require
 from node.capture import Capture
 from node.durable import NoRoom
 from node.journal import Interrupted
-from node.library import Library, verify
+from node.library import LATEST, Library, verify
 from node.partial import write_partial
 from node.sidecar import Conflict, Sidecar, decode_changes
 from protocol.errors import LibraryError
@@ -79,7 +82,7 @@ class LibraryRoutes:
 
     async def _annotate(self, request: web.Request) -> web.Response:
         require(request, "operate")
-        scan_id, revision = self._known(request), _revision(request)
+        scan_id, revision = self._named(request), _revision(request)
         with _explained():
             changes = decode_changes(await request.read())
             by = self._who(request)[:100]
@@ -93,17 +96,22 @@ class LibraryRoutes:
 
     async def _delete(self, request: web.Request) -> web.Response:
         require(request, "admin")
-        scan_id = self._known(request)
+        scan_id = self._named(request)
         with _explained():
             await asyncio.to_thread(self._library.delete, scan_id)
         self._deleted(scan_id)
         return web.Response(status=204)
 
+    def _named(self, request: web.Request) -> str:
+        """The scan that is to be changed. Raises 400 for "latest", 404."""
+        if request.match_info["scan"] == LATEST:
+            raise web.HTTPBadRequest(text="name the scan to change by its id: another may be the latest by now")
+        return self._known(request)
+
     def _known(self, request: web.Request) -> str:
         """The scan that is asked for. Raises 404."""
-        scan_id: str = request.match_info["scan"]
         try:
-            return self._library.summary(scan_id).id
+            return self._library.summary(self._library.resolve(request.match_info["scan"])).id
         except LibraryError as error:
             raise web.HTTPNotFound(text=str(error)) from error
 
