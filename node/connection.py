@@ -40,6 +40,7 @@ HELLO_S = 10.0
 ACK_S = 60.0
 QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
 CLOSE_PROTOCOL_ERROR = 1002
+CLOSE_REASON_MAX = 120  # of 123 bytes
 
 
 @dataclass(slots=True, eq=False)
@@ -113,7 +114,7 @@ class Connection:
         """Say goodbye and end the stream."""
         if self._session.phase is Phase.READY:
             await self._send(m.Goodbye(reason))
-        await self._socket.close(message=reason.encode()[:120])
+        await self._socket.close(message=_cut(reason))
 
     # -- reading ---------------------------------------------------------------------------------------------------
 
@@ -195,6 +196,8 @@ class Connection:
         bound = self._bound
         if bound is None or said.epoch != bound.epoch:
             return
+        if said.next_seq > bound.next_seq:
+            raise RemoteWireError(f"state: refinement {said.next_seq} cannot be next, {bound.next_seq} is")
         _adopt_word(bound, said)
         bound.next_seq = said.next_seq
         self._acknowledged.set()
@@ -336,7 +339,12 @@ class Connection:
     async def _turn_away(self, why: str) -> None:
         log.warning("stream ended: %s", why)
         if not self._socket.closed:
-            await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=why.encode()[:120])
+            await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=_cut(why))
+
+
+def _cut(reason: str) -> bytes:
+    """As much of a reason as fits a close frame, whole characters only."""
+    return reason.encode()[:CLOSE_REASON_MAX].decode(errors="ignore").encode()
 
 
 def _adopt_word(bound: _Bound, said: m.State) -> None:

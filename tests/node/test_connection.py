@@ -1,0 +1,84 @@
+"""A stream whose client breaks the rules: it is told why and sent away, in whole characters; nobody else notices."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import aiohttp
+import msgspec
+import pytest
+from aiohttp import ClientWebSocketResponse, WSMsgType
+from aiohttp.test_utils import TestClient, TestServer
+
+from node.config import load_config
+from node.exhibits import Exhibits
+from node.library import About, Library
+from node.live import Live
+from node.serve import NodeServer
+from protocol import messages as m
+from protocol.holdings import Holdings
+from protocol.lattice import Channel
+from tests.node.scans import make_grid
+
+Client = TestClient[aiohttp.web.Request, aiohttp.web.Application]
+
+
+@pytest.fixture
+async def node(tmp_path: Path) -> AsyncIterator[Client]:
+    library = Library(tmp_path)
+    library.add(make_grid(), About(0.0))
+    exhibits = Exhibits(library, 32768, 2)
+    config = load_config(None, {"server.insecure": True})
+    server = NodeServer(config, m.ServerInfo(m.PROTOCOL, "id", "name", "0"), exhibits, Live(lambda: None), None)
+    async with TestClient(TestServer(server._app)) as client:
+        yield client
+    exhibits.close()
+
+
+async def opened(node: Client) -> tuple[ClientWebSocketResponse, m.Opened]:
+    """A stream with the newest scan open, its first view received and not acknowledged."""
+    stream = await node.ws_connect("/v1/stream", protocols=[m.PROTOCOL])
+    for said in (m.Hello(m.PROTOCOL), m.Open(1, "latest")):
+        await stream.send_str(m.encode_message(said))
+    answers = [await stream.receive() for _ in range(5)]
+    assert [answer.type for answer in answers] == [WSMsgType.TEXT] * 3 + [WSMsgType.BINARY] * 2
+    answer = m.decode_message(answers[2].data)
+    assert isinstance(answer, m.Opened)
+    return stream, answer
+
+
+def state(answer: m.Opened, next_seq: int) -> m.State:
+    """What a client says that holds the first view and waits for next_seq."""
+    held = Holdings.coarse(answer.scan.shapes()).channels
+    return m.State(
+        answer.epoch, next_seq, m.Statement(held[Channel.RANGE].to_runs(), held[Channel.TEXTURE].to_runs())
+    )
+
+
+@pytest.mark.parametrize("next_seq", [3, 0xFFFFFFFF])
+async def test_a_client_cannot_wait_for_what_was_never_sent(node: Client, next_seq: int) -> None:
+    stream, answer = await opened(node)
+    await stream.send_str(m.encode_message(state(answer, next_seq)))
+    end = await stream.receive()
+    assert (end.type, end.data) == (WSMsgType.CLOSE, 1002)
+    assert end.extra == f"state: refinement {next_seq} cannot be next, 2 is"
+
+
+async def test_a_client_may_state_what_it_holds_at_any_time(node: Client) -> None:
+    stream, answer = await opened(node)
+    for said in (state(answer, 2), m.Look(7, 0.5, 0.5, max_bytes=0)):
+        await stream.send_str(m.encode_message(said))
+    updated = m.decode_message((await stream.receive()).data)
+    assert isinstance(updated, m.Updated)
+    assert (updated.request, updated.next_seq) == (7, 2)
+    await stream.close()
+
+
+@pytest.mark.parametrize("letter", ["a", "é", "中", "😀"])
+async def test_the_reason_of_a_close_is_whole_characters(node: Client, letter: str) -> None:
+    stream, _ = await opened(node)
+    await stream.send_str(msgspec.json.encode({"type": 150 * letter}).decode())
+    end = await stream.receive()
+    assert (end.type, end.data) == (WSMsgType.CLOSE, 1002)
+    assert end.extra.startswith(f"bad message: Invalid value '{letter}")
