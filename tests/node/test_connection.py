@@ -81,4 +81,4 @@ async def test_the_reason_of_a_close_is_whole_characters(node: Client, letter: s
     await stream.send_str(msgspec.json.encode({"type": 150 * letter}).decode())
     end = await stream.receive()
     assert (end.type, end.data) == (WSMsgType.CLOSE, 1002)
-    assert end.extra.startswith(f"bad message: Invalid value '{letter}")
+    assert str(end.extra).startswith(f"bad message: Invalid value '{letter}")
