@@ -60,6 +60,9 @@ CURES = {
     errno.EHOSTUNREACH: "check the address and the network",
     errno.ENOENT: "check the path",
     errno.ENOSPC: "free some disk space",
+    errno.EISDIR: "name a file, not a folder",
+    errno.ENOTDIR: "check the path: a file stands where a folder is expected",
+    errno.EEXIST: "choose another name",
     errno.EROFS: "choose a folder that can be written",
 }
 
@@ -246,9 +249,10 @@ def _end(program: subprocess.Popen[bytes]) -> None:
 
 def one_line(problem: Exception) -> str:
     """What went wrong and its cure, without line breaks."""
-    cure = CURES.get(problem.errno or 0) if isinstance(problem, OSError) else None
-    text = f"{_what(problem)}; {cure}" if cure else _what(problem)
-    return " ".join(text.split())
+    text = " ".join(_what(problem).split())
+    cause = problem if isinstance(problem, OSError) else problem.__cause__
+    cure = CURES.get(cause.errno or 0) if isinstance(cause, OSError) and "; " not in text else None
+    return f"{text}; {cure}" if cure else text
 
 
 def _what(problem: Exception) -> str:

@@ -42,13 +42,14 @@ class Lock:
     """The right to write in a library, held until `release` or the end of the process."""
 
     def __init__(self, folder: Path) -> None:
+        self._handle = -1
         self._handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             holder = os.pread(self._handle, 20, 0).decode(errors="replace").strip() or "another one"
             self.release()
-            raise LibraryError(f"the library {folder} is in use by process {holder}") from None
+            raise LibraryError(f"the library {folder} is in use by process {holder}; end that first") from None
         os.ftruncate(self._handle, 0)
         os.pwrite(self._handle, f"{os.getpid()}\n".encode(), 0)
 

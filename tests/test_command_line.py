@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 import foveascan
+from client.errors import NodeLost
 from foveascan import PROGRAM
-from protocol.errors import ConfigError, FoveascanError
+from protocol.errors import ConfigError, FoveascanError, LibraryError
 
 HEAVY = {"numpy", "cv2", "imagecodecs", "msgspec", "aiohttp", "asyncio", "zeroconf", "serial", "usb", "trimesh", "tqdm"}
 
@@ -60,6 +61,11 @@ def test_the_status_of_a_subcommand_is_the_status_of_the_command(monkeypatch: py
     assert foveascan.main(["try"]) == 7
 
 
+def caused(problem: Exception, number: int) -> Exception:
+    problem.__cause__ = OSError(number, os.strerror(number))
+    return problem
+
+
 @pytest.mark.parametrize(
     ("problem", "line"),
     [
@@ -71,6 +77,9 @@ def test_the_status_of_a_subcommand_is_the_status_of_the_command(monkeypatch: py
         (OSError(errno.EADDRINUSE, "Address already in use"),
          "Address already in use; another program listens there: stop it or choose another --listen"),
         (OSError("a message without a number"), "a message without a number"),
+        (caused(LibraryError("the library a cannot be used: Read-only file system"), errno.EROFS),
+         "the library a cannot be used: Read-only file system; choose a folder that can be written"),
+        (caused(NodeLost("connection refused; start a node"), errno.ECONNREFUSED), "connection refused; start a node"),
     ],
 )  # fmt: skip
 def test_failure_is_one_line_on_stderr(

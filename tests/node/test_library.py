@@ -275,6 +275,12 @@ def test_a_library_is_one_process_s_at_a_time(tmp_path: Path) -> None:
     assert _reopened(library).scans() == []
 
 
+def test_a_library_that_cannot_be_locked_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "lock").mkdir()
+    with pytest.raises(LibraryError, match="cannot be used: Is a directory"):
+        Library(tmp_path)
+
+
 def test_a_library_of_a_newer_version_is_refused_untouched(tmp_path: Path) -> None:
     library = Library(tmp_path)
     library.add(_grid(0), ABOUT)
