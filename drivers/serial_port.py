@@ -6,6 +6,7 @@ that is always ready and always empty, a closed or missing descriptor. All of th
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import termios
@@ -21,6 +22,11 @@ _WRITE_TIMEOUT_S = 2.0
 _GATHER_S = 0.008  # bytes that follow within this time are read at once: fewer wake-ups; at 3 Mbaud that is 2.4 KB
 _GATHER_BELOW_BYTES = 1024  # the kernel's own buffer holds 4 KiB
 _GONE = (OSError, termios.error, TypeError, ValueError)  # pyserial's SerialException is an OSError
+_CURES = {
+    errno.EACCES: "permission denied; join the group that owns it (foveascan doctor names it)",
+    errno.EAGAIN: "another program has it open; end that (fuser -v names it)",
+    errno.ENOENT: "no such file; plug the scanner in, or correct the path",
+}
 
 
 class SerialPort:
@@ -35,7 +41,7 @@ class SerialPort:
         try:
             self._serial = serial.Serial(path, baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
         except _GONE as error:
-            raise PortLost(f"{path}: cannot open: {error}") from error
+            raise PortLost(f"{path}: cannot open: {_why(error)}") from error
         self._wake_read, self._wake_write = os.pipe()
 
     @property
@@ -87,3 +93,8 @@ class SerialPort:
         except _GONE as error:
             self._is_lost = True
             raise PortLost(f"{self._name}: {doing} failed: {error}") from error
+
+
+def _why(error: Exception) -> str:
+    """Why a port does not open, with the cure where one is known."""
+    return _CURES.get(getattr(error, "errno", None) or 0, str(error))

@@ -106,7 +106,7 @@ def test_a_line_that_takes_nothing_is_lost(line: Line, monkeypatch: pytest.Monke
 
 
 def test_a_port_opened_twice_is_refused(line: Line) -> None:
-    with pytest.raises(PortLost, match="cannot open"):
+    with pytest.raises(PortLost, match="cannot open: another program has it open; end that"):
         SerialPort(line.port.name)
 
 
@@ -114,6 +114,8 @@ def test_what_cannot_be_opened_says_which_path(tmp_path: Path) -> None:
     for path in (tmp_path / "missing", tmp_path):
         with pytest.raises(PortLost, match=str(path)):
             SerialPort(str(path))
+    with pytest.raises(PortLost, match="cannot open: no such file; plug the scanner in, or correct the path$"):
+        SerialPort(str(tmp_path / "missing"))
 
 
 def test_closing_twice_and_using_a_closed_port(line: Line) -> None:
