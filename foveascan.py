@@ -40,6 +40,7 @@ import client.command
 import node.command
 import simulators.command
 from protocol.errors import FoveascanError
+from protocol.printable import printable
 
 __version__ = "0.1.0"
 
@@ -249,7 +250,7 @@ def _end(program: subprocess.Popen[bytes]) -> None:
 
 def one_line(problem: Exception) -> str:
     """What went wrong and its cure, without line breaks."""
-    text = " ".join(_what(problem).split())
+    text = printable(" ".join(_what(problem).split()))
     cause = problem if isinstance(problem, OSError) else problem.__cause__
     cure = CURES.get(cause.errno or 0) if isinstance(cause, OSError) and "; " not in text else None
     return f"{text}; {cure}" if cure else text

@@ -8,6 +8,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from client import exchange_command, scan_command
+from protocol.printable import printable
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -59,7 +60,7 @@ def run_discover(args: argparse.Namespace) -> int:
         nodes = asyncio.run(discover(args.timeout, args.name))
         bar.update()
     for node in nodes:
-        _print(args, _node_record(node), f"{node.url}  {node.name}  {node.state}")
+        _print(args, _node_record(node), f"{node.url}  {printable(node.name)}  {node.state}")
     if not nodes:
         raise _no_node(args.timeout)
     return 0

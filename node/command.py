@@ -34,14 +34,14 @@ def run_serve(args: argparse.Namespace) -> int:
     """Run the node until SIGTERM or SIGINT."""
     import asyncio
     import json
-    import logging
 
     import uvloop
 
     from node.config import load_config
     from node.daemon import run_node
+    from node.log import start_log
 
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    start_log()
     overrides = {
         "library.folder": args.library,
         "server.listen": args.listen,

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.errors import LibraryError
+from protocol.printable import printable
 
 if TYPE_CHECKING:
     from node.library import Library, ScanSummary
@@ -183,7 +184,7 @@ def _line(scan: ScanSummary) -> str:
     s = scan.spec
     made = datetime.fromtimestamp(scan.about.created_unix_s).isoformat(" ", "minutes")
     shape = f"{s.width} x {s.height} + {s.texture_width} x {s.texture_height}"
-    return f"{scan.id[:12]}  {made}  {shape}  {scan.about.name}".rstrip()
+    return f"{scan.id[:12]}  {made}  {shape}  {printable(scan.about.name)}".rstrip()
 
 
 def _as_json(scan: ScanSummary) -> dict[str, object]:

@@ -72,6 +72,7 @@ def caused(problem: Exception, number: int) -> Exception:
         (ConfigError("capture.baud: expected int"), "capture.baud: expected int"),
         (FoveascanError("two\nlines\tof it"), "two lines of it"),
         (FoveascanError(), "FoveascanError"),
+        (FoveascanError("said by a node: \x1b[31m"), r"said by a node: \x1b[31m"),
         (FileNotFoundError(errno.ENOENT, "No such file or directory", "a.toml"),
          "a.toml: No such file or directory; check the path"),
         (OSError(errno.EADDRINUSE, "Address already in use"),

@@ -55,6 +55,14 @@ def test_list_shows_scans_newest_first_and_what_else_is_there(folder: Path, caps
     assert third == "holiday: not a scan; left alone"
 
 
+def test_a_name_cannot_steer_the_terminal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    library = Library(folder)
+    library.rename(library.scans()[0].id, "red \x1b[31m\nline", "ana")
+    library.close()
+    assert run("list", "--library", folder) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith(r"red \x1b[31m\nline")
+
+
 def test_list_works_while_a_node_runs_and_rename_does_not(folder: Path) -> None:
     library = Library(folder)
     assert run("list", "--library", folder) == 0

@@ -1,0 +1,8 @@
+"""Foreign text where people read it: what others wrote must not steer a terminal or forge a line of a log."""
+
+from __future__ import annotations
+
+
+def printable(text: str) -> str:
+    r"""The text with line breaks, control and formatting characters as escapes ("\n", "\x1b"), all else as it is."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
