@@ -5,25 +5,35 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from simulators.carriers import PtyPort
+    from simulators.carriers import ServedPort
+    from simulators.faults import FaultyScanner
     from simulators.specimen import Specimen
 
 BITS_PER_BYTE = 10  # on a serial line: start, eight data, stop
+BAUD = 3_000_000
+USB_BYTES_S = 35e6
+USB_PORTION_BYTES = 65536
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `simulate`."""
-    simulate = subparsers.add_parser("simulate", help="a software scanner with known truth, on a pseudo terminal")
-    simulate.add_argument("--link", choices=("pty",), default="pty", help="what the node opens (pty)")
-    simulate.add_argument("--path", required=True, type=Path, help="symbolic link to create for the node to open")
+    simulate = subparsers.add_parser("simulate", help="a software scanner with known truth")
+    simulate.add_argument("--link", choices=("pty", "usb"), default="pty", help="what the node opens (pty)")
+    simulate.add_argument(
+        "--path",
+        required=True,
+        type=Path,
+        help="pty: symbolic link to create for the node to open; usb: folder for the emulated device",
+    )
     simulate.add_argument(
         "--specimen",
         default="head",
@@ -40,10 +50,21 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
         "--jitter", type=_real(0, 1e6), default=0.0, metavar="COUNTS", help="deviation of the triggers (0)"
     )
     speed = simulate.add_mutually_exclusive_group()
-    speed.add_argument("--baud", type=_whole(300, 10**9), default=3_000_000, help="of the line (3000000)")
+    speed.add_argument("--baud", type=_whole(300, 10**9), help="of the line (pty: 3000000; usb: 35e6 bytes a second)")
     speed.add_argument(
         "--link-rate", type=_real(30, 1e9), metavar="BYTES_S", help="bytes a second over the line, instead of --baud"
     )
+    simulate.add_argument(
+        "--faults",
+        default="",
+        metavar="NAME=VALUE,...",
+        help="what goes wrong, e.g. flip=0.01,unplug=2; an unknown name lists them all",
+    )
+    simulate.add_argument("--order", choices=("live", "buffered"), default="live", help="of the columns (live)")
+    simulate.add_argument(
+        "--retention", type=_whole(1, 65535), default=65535, help="columns held to be sent again (65535)"
+    )
+    simulate.add_argument("--serial-number", default="SIM-0001", help="of the scanner (SIM-0001)")
     simulate.add_argument("--truth", type=Path, metavar="FILE", help="write what the node should see, as a .npz grid")
     simulate.add_argument("--json", action="store_true", help="print one JSON object a line")
     simulate.set_defaults(run=run_simulate)
@@ -53,38 +74,81 @@ def run_simulate(args: argparse.Namespace) -> int:
     """Serve sweeps until SIGTERM or SIGINT."""
     from exchange.native import write_native
     from exchange.whole_file import whole_file
-    from simulators.carriers import PtyPort, serve
-    from simulators.scanner import SimulatedScanner
+    from simulators.carriers import PORTION_BYTES, serve
     from simulators.specimen import make_specimen
-    from simulators.turntable import Turntable
 
     specimen = make_specimen(args.specimen, args.size, args.texture, args.seed)
+    scanner = _scanner(args, specimen)
     if args.truth is not None:
         with whole_file(args.truth) as file:
             write_native(specimen.grid, file, specimen.name)
-    table = Turntable(specimen, turn_s=args.turn, jitter_counts=args.jitter, seed=args.seed)
-    baud = args.baud if args.link_rate is None else round(BITS_PER_BYTE * args.link_rate)
-    with closing(PtyPort(args.path, baud)) as port, _stopped_by_signals(port) as stop:
-        print(_ready(args, specimen, baud), flush=True)
-        serve(SimulatedScanner(table), port, stop)
+    portion = USB_PORTION_BYTES if args.link == "usb" else PORTION_BYTES
+    with _port(args) as (port, about), _stopped_by_signals(port) as stop:
+        print(_ready(args, specimen, about), flush=True)
+        serve(scanner, port, stop, portion)
     return 0
 
 
-def _ready(args: argparse.Namespace, specimen: Specimen, baud: int) -> str:
+def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
+    """The scanner asked for, with its faults. Raises ConfigError."""
+    from protocol.framing import SERIAL_PAYLOAD_MAX, USB_PAYLOAD_MAX
+    from protocol.scanner_messages import Order
+    from simulators.faults import FaultyScanner, parse_faults
+    from simulators.scanner import SimulatedScanner
+    from simulators.turntable import Turntable
+
+    faults, flaws = parse_faults(args.faults, args.seed)
+
+    def boot(boot_id: int) -> SimulatedScanner:
+        table = Turntable(specimen, turn_s=args.turn, jitter_counts=args.jitter, seed=args.seed, flaws=flaws)
+        return SimulatedScanner(
+            table,
+            serial_number=args.serial_number,
+            boot_id=boot_id,
+            retention_columns=args.retention,
+            payload_max=USB_PAYLOAD_MAX if args.link == "usb" else SERIAL_PAYLOAD_MAX,
+            order=Order[args.order.upper()],
+        )
+
+    return FaultyScanner(boot, faults, args.seed)
+
+
+@contextmanager
+def _port(args: argparse.Namespace) -> Iterator[tuple[ServedPort, dict[str, Any]]]:
+    """The scanner's end of the line, and what the node has to know of it."""
+    from simulators.carriers import PtyPort
+    from simulators.usb_descriptors import UsbIdentity
+    from simulators.usb_testbed import UsbTestbed
+
+    rate_bytes_s = args.link_rate or (args.baud or 0) / BITS_PER_BYTE
+    if args.link == "usb":
+        identity = UsbIdentity(serial_number=args.serial_number)
+        with closing(UsbTestbed(args.path, identity, rate_bytes_s or USB_BYTES_S)) as bed:
+            yield bed, {"path": identity.address, "environment": bed.environment}
+    else:
+        baud = round(BITS_PER_BYTE * rate_bytes_s) or BAUD
+        with closing(PtyPort(args.path, baud)) as pty:
+            yield pty, {"path": str(args.path), "baud": baud}
+
+
+def _ready(args: argparse.Namespace, specimen: Specimen, about: dict[str, Any]) -> str:
     """The line that says that the scanner can be opened now."""
     spec = specimen.grid.spec
     if args.json:
         shape = {"range": [spec.height, spec.width], "texture": [spec.texture_height, spec.texture_width]}
-        report = {"ready": True, "path": str(args.path), "specimen": specimen.name, "shape": shape, "baud": baud}
-        return json.dumps(report)
-    return (
-        f"Scanner ready at {args.path}: {specimen.name}, range {spec.width} x {spec.height}, "
-        f"texture {spec.texture_width} x {spec.texture_height}, {baud} baud. Ctrl-C ends it."
+        return json.dumps({"ready": True, "specimen": specimen.name, "shape": shape, **about})
+    said = (
+        f"Scanner ready at {about['path']}: {specimen.name}, range {spec.width} x {spec.height}, "
+        f"texture {spec.texture_width} x {spec.texture_height}"
     )
+    if args.link == "usb":
+        variables = " ".join(f"{key}={shlex.quote(value)}" for key, value in about["environment"].items())
+        return f"{said}. Start the node so: {variables} foveascan serve --scanner {about['path']} ... Ctrl-C ends it."
+    return f"{said}, {about['baud']} baud. Ctrl-C ends it."
 
 
 @contextmanager
-def _stopped_by_signals(port: PtyPort) -> Iterator[threading.Event]:
+def _stopped_by_signals(port: ServedPort) -> Iterator[threading.Event]:
     """An event that SIGTERM and SIGINT set, waking whoever reads the port."""
     stop = threading.Event()
 

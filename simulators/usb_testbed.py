@@ -5,7 +5,7 @@ come here over a Unix socket, and plugging shows as a udev event. What a carrier
 ends when it is full, or with a packet that is not (one of length zero if need be), as on a kernel.
 
 The preload's messages are three u64 (kind, two arguments) and data: 1 ioctl(request, address), 3 done(result, errno),
-5 read(address, size), 6 write(address, size). Source: umockdev's ioctl_tree protocol, checked against a kernel's gadget.
+5 read(address, size), 6 write(address, size). Source: umockdev's ioctl_tree, checked against a kernel's gadget.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def test_without_json_it_speaks_to_people(tmp_path: Path) -> None:
         ("--path", "p", "--jitter", "-1"),
         ("--path", "p", "--seed", "one"),
         ("--path", "p", "--turn", "0"),
-        ("--path", "p", "--link", "usb"),
+        ("--path", "p", "--link", "tape"),
     ],
 )
 def test_wrong_usage_is_refused(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,3 +142,23 @@ def test_an_unknown_specimen_is_refused_before_a_link_is_made(tmp_path: Path) ->
 def test_importing_the_command_costs_nothing() -> None:
     code = "import sys, simulators.command; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_an_unknown_fault_is_refused_with_the_names_there_are(tmp_path: Path) -> None:
+    args = parse("--path", str(tmp_path / "scanner"), "--faults", "rain=1")
+    with pytest.raises(ConfigError, match="'rain' is none of loss, flip"):
+        args.run(args)
+
+
+def test_a_faulty_buffered_scanner_still_serves_the_truth(tmp_path: Path) -> None:
+    link = tmp_path / "scanner"
+    options = ("--faults", "flip=0.01,twice=0.05", "--order", "buffered", "--serial-number", "B-2")
+    with simulated(link, *FAST) as _:
+        clean = sweep(link)
+    with simulated(link, *FAST, *options) as _:
+        assert sweep(link) == clean
+
+
+def test_a_usb_scanner_tells_the_environment_the_node_needs(tmp_path: Path) -> None:
+    with simulated(tmp_path / "usb", "--link", "usb", "--specimen", "sphere") as (_, ready):
+        assert ready["path"] == "usb:1209:5ca1" and ready["environment"]["UMOCKDEV_DIR"] == str(tmp_path / "usb")
