@@ -39,12 +39,15 @@ BACKOFF_S = (0.5, 8.0)
 LISTEN_S = 1.0
 
 SweepEvents = Generator[SweepEvent, None, None]
-Phase = Literal["no scanner", "connecting", "ready", "sweeping", "stopped"]
+Phase = Literal["no scanner", "connecting", "ready", "starting", "sweeping", "stopped"]
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureStatus:
-    """What the scanner is doing. progress: share of the sweep that is in; sweeps: finished ones; why: last trouble."""
+    """What the scanner is doing. progress: share of the sweep that is in; sweeps: finished ones; why: last trouble.
+
+    From the moment that a sweep is asked for until it has ended, why says nothing of earlier ones.
+    """
 
     phase: Phase
     progress: float = 0.0
@@ -94,7 +97,10 @@ class Capture:
     @property
     def status(self) -> CaptureStatus:
         """What is going on now."""
-        return self._status
+        with self._lock:
+            if self._order is not None and self._status.phase == "ready":
+                return replace(self._status, phase="starting", why="")
+            return self._status
 
     @property
     def beat_s(self) -> float:

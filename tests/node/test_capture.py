@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.scanner import ScannerConfig, SweepEvent, SweepInterrupted, SweepProgress, SweepStarted
+from drivers.scanner import Scanner, ScannerConfig, SweepEvent, SweepInterrupted, SweepProgress, SweepStarted
 from drivers.serial_port import SerialPort
 from node import durable
-from node.capture import Capture
+from node.capture import Capture, CaptureStatus
 from node.journal import Journals
 from node.resume import publish_complete
 from protocol.errors import LibraryError
@@ -131,6 +131,30 @@ def test_only_one_sweep_is_asked_for_at_a_time(plug: Plug, node: Node) -> None:
     plug.plug(device(turn_s=0.5))
     node.sweep_until_columns()
     assert not node.capture.request_sweep()
+    assert is_truth(node.grids.get(timeout=WAIT_S))
+
+
+def test_a_sweep_asked_for_is_starting_and_older_trouble_forgotten(
+    plug: Plug, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    idle, look_up = threading.Semaphore(0), threading.Semaphore(0)
+
+    def watch(scanner: Scanner, listen_s: float) -> None:
+        idle.release()
+        look_up.acquire(timeout=WAIT_S)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Scanner, "watch", watch)
+        patch.setattr(durable, "free_bytes", lambda folder: 0)
+        plug.plug(device())
+        assert idle.acquire(timeout=WAIT_S)
+        assert node.capture.request_sweep() and node.capture.status == CaptureStatus("starting")
+        look_up.release()
+        assert idle.acquire(timeout=WAIT_S)
+        node.wait_until("ready", "the disk is full")
+        assert node.capture.request_sweep() and node.capture.status == CaptureStatus("starting")
+        assert not node.capture.request_sweep()
+    look_up.release()
     assert is_truth(node.grids.get(timeout=WAIT_S))
 
 

@@ -43,7 +43,7 @@ export const strings = {
     start: 'Start a sweep',
     started: 'The sweep has been started.',
     phases: {
-      ready: 'Ready', sweeping: 'Sweeping', connecting: 'Looking for the scanner', 'no scanner': 'No scanner at this node',
+      ready: 'Ready', starting: 'Starting', sweeping: 'Sweeping', connecting: 'Looking for the scanner', 'no scanner': 'No scanner at this node',
       stopped: 'Stopped',
     } as Record<string, string>,
     progress: 'Progress of the sweep',
