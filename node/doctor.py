@@ -22,6 +22,7 @@ import msgspec
 
 from node import config as settings
 from node.advertise import HEARD_S, is_heard
+from node.durable import EASY_BYTES
 from node.identity import node_identity
 from node.library import survey
 from node.machine import (
@@ -37,17 +38,16 @@ from node.machine import (
     serial_ports,
     written_last_s,
 )
+from node.scan_folder import name_problems
 from protocol.errors import ConfigError, LibraryError
 
 RULE = "70-foveascan.rules"
 SWEEP_M_BYTES = 1440 * 1024 * 2 + 4096 * 2048 * 3
 SWEEP_L_BYTES = 4096 * 2048 * 2 + 8192 * 4096 * 3
 DISK_MIN_BYTES = 2 * SWEEP_L_BYTES  # a journal and the scan it becomes
-DISK_EASY_BYTES = 1 << 30
 MEMORY_BASE_BYTES, MEMORY_FACTOR = 150 << 20, 6  # issue 3: 6x the arrays of a scan, and this
 ANSWER_S = 2.0
 ANSWER_BYTES_MAX = 65536
-NAMED_MAX = 3
 
 State = Literal["ok", "warning", "problem"]
 
@@ -164,7 +164,7 @@ def check_disk(folder: Path, account: Account) -> Finding:
     if free < DISK_MIN_BYTES:
         cure = f"free some space: a sweep of size L takes {_size(DISK_MIN_BYTES)} while it is kept"
         return Finding("disk", "problem", found, cure)
-    if free < DISK_EASY_BYTES:
+    if free < EASY_BYTES:
         return Finding("disk", "warning", found, "back scans up and delete them here, or use a larger disk")
     return Finding("disk", "ok", found)
 
@@ -221,9 +221,9 @@ def check_library(folder: Path) -> Finding:
     found = f"{len(known)} scans in {folder}"
     if not problems:
         return Finding("library", "ok", found)
-    named = "; ".join(f"{problem.name}: {problem.reason}" for problem in problems[:NAMED_MAX])
+    found += f", and {len(problems)} things that are none ({name_problems(problems)})"
     cure = "they are left alone: move away what does not belong there, restore damaged scans from a backup"
-    return Finding("library", "warning", f"{found}, and {len(problems)} things that are none ({named})", cure)
+    return Finding("library", "warning", found, cure)
 
 
 def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:

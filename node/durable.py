@@ -9,6 +9,7 @@ from pathlib import Path
 from protocol.errors import LibraryError
 
 NEW = ".new"
+EASY_BYTES = 1 << 30  # with less left, a disk is nearly full
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

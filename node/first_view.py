@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from node.coded import FRAME_BYTES
 from node.library import Scan
@@ -70,7 +71,16 @@ def scan_info(scan: Scan) -> ScanInfo:
         coarse_width=coarse.range_steps.shape[1], coarse_height=coarse.range_steps.shape[0],
         coarse_texture_width=coarse.texture.shape[1], coarse_texture_height=coarse.texture.shape[0],
         step_mm=s.step_mm, pitch_mm=s.pitch_mm, z_max_mm=s.z_max_mm, theta0_rad=s.theta0_rad,
+        created=_utc(scan.about.created_unix_s),
     )  # fmt: skip
+
+
+def _utc(unix_s: float) -> str:
+    """A time as ISO 8601 writes it, to the second; empty where a clock so wrong has no date."""
+    try:
+        return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    except (ValueError, OverflowError, OSError):
+        return ""
 
 
 def _texture(scan: Scan, codec: CodecName, max_bytes: int) -> Refinement:

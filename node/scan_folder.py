@@ -16,6 +16,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ FORMAT = 1
 RECORD_BYTES_MAX = 65536
 ARRAY_HEADER_BYTES_MAX = 4096
 TEXT_MAX = 200
+NAMED_MAX = 3
 SCAN_ID = re.compile("[0-9a-f]{32}")
 INCOMING = ".incoming-"
 RANGE_FILE, TEXTURE_FILE, RECORD_FILE = "range.npy", "texture.npy", "scan.json"
@@ -61,6 +63,11 @@ class Problem:
 
     name: str
     reason: str
+
+
+def name_problems(problems: Sequence[Problem]) -> str:
+    """The first few of them, in words for people."""
+    return "; ".join(f"{problem.name}: {problem.reason}" for problem in problems[:NAMED_MAX])
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

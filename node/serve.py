@@ -12,12 +12,13 @@ from aiohttp import web
 from aiohttp.typedefs import Handler
 
 from node.auth import Auth, require
-from node.capture import Capture
+from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
+from node.health import Health, examine_health
 from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
 from node.live import Live
@@ -54,6 +55,7 @@ class NodeServer:
         self._exhibits = exhibits
         self._live = live
         self._capture = capture
+        self._is_stopping = False
         self._auth = Auth(config.server)
         self._shared = SharedFoveae(exhibits, shared_cache=config.server.shared_cache)
         self._connections: dict[Connection, asyncio.Transport] = {}
@@ -84,6 +86,7 @@ class NodeServer:
 
     async def stop(self) -> None:
         """Tell every client, hang up on those that do not listen, then stop listening."""
+        self._is_stopping = True
         goodbyes = [asyncio.ensure_future(connection.close("the node is stopping")) for connection in self._connections]
         if goodbyes:
             await asyncio.wait(goodbyes, timeout=GOODBYE_S)
@@ -109,12 +112,18 @@ class NodeServer:
     # -- what may be asked -----------------------------------------------------------------------------------------
 
     async def _health(self, request: web.Request) -> web.Response:
-        return _json({"status": "ready", "capture": self._capture_status()})
+        capture = self._capture_status()
+        if self._is_stopping or capture.phase == "stopped":
+            health = Health("stopping")
+        else:
+            health = await asyncio.to_thread(examine_health, capture, self._exhibits.library)
+        status = 503 if health.status == "stopping" else 200
+        return _json({**asdict(health), "capture": asdict(capture)}, status)
 
     async def _node(self, request: web.Request) -> web.Response:
         problems = [asdict(problem) for problem in self._exhibits.library.problems]
         node = msgspec.to_builtins(self._info)
-        status = {"capture": self._capture_status(), "sharedEncodes": self._shared.encodes}
+        status = {"capture": asdict(self._capture_status()), "sharedEncodes": self._shared.encodes}
         return _json({**node, **status, "problems": problems})
 
     async def _scans(self, request: web.Request) -> web.Response:
@@ -137,7 +146,7 @@ class NodeServer:
             raise web.HTTPConflict(text="this node has no scanner: start it with --scanner PATH")
         if not self._capture.request_sweep():
             raise web.HTTPConflict(text="a sweep is running already")
-        return _json(self._capture_status(), status=202)
+        return _json(asdict(self._capture_status()), status=202)
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         if len(self._connections) >= self._config.server.max_clients:
@@ -160,8 +169,8 @@ class NodeServer:
             del self._connections[connection]
         return stream
 
-    def _capture_status(self) -> dict[str, object]:
-        return asdict(self._capture.status) if self._capture else {"phase": "no scanner"}
+    def _capture_status(self) -> CaptureStatus:
+        return self._capture.status if self._capture else CaptureStatus("no scanner")
 
 
 def _summary(scan: ScanSummary) -> dict[str, object]:

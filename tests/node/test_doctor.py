@@ -19,6 +19,7 @@ import foveascan
 from node import config as settings
 from node import doctor, machine
 from node.doctor import Finding
+from node.durable import EASY_BYTES
 from node.library import About, Library
 from node.machine import Account
 from protocol.grid import Grid, GridSpec
@@ -183,7 +184,7 @@ def test_a_free_address_is_fine_one_that_is_not_ours_is_a_problem() -> None:
 
 def test_a_disk_is_judged_by_what_a_sweep_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
-    for free in (doctor.DISK_MIN_BYTES - 1, doctor.DISK_EASY_BYTES - 1, doctor.DISK_EASY_BYTES):
+    for free in (doctor.DISK_MIN_BYTES - 1, EASY_BYTES - 1, EASY_BYTES):
         monkeypatch.setattr("shutil.disk_usage", lambda place, free=free: SimpleNamespace(free=free))
         found.append(doctor.check_disk(tmp_path / "not" / "there", ROOT))
     assert states(*found) == ["problem", "warning", "ok"]
