@@ -21,8 +21,9 @@ async function page(out) {
   const common = { ...COMMON, minify: true, platform: 'browser', external: ['fs', 'path'], outdir: out, metafile: true };
   const worker = named((await build({ ...common, entryPoints: ['src/worker.ts'] })).metafile.outputs, 'src/worker.ts');
   const define = { WORKER_FILE: JSON.stringify(worker) };
-  const outputs = (await build({ ...common, define, entryPoints: ['src/main.ts', 'src/style.css'] })).metafile.outputs;
-  const names = { script: named(outputs, 'src/main.ts'), style: named(outputs, 'src/style.css'), worker };
+  const outputs = (await build({ ...common, define, entryPoints: ['src/boot.ts', 'src/main.ts', 'src/style.css'] })).metafile.outputs;
+  const [boot, script, style] = ['boot.ts', 'main.ts', 'style.css'].map((entry) => named(outputs, `src/${entry}`));
+  const names = { boot, script, style };
   const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name]);
   await writeFile(join(out, 'index.html'), html);
   for (const file of await readdir(out)) await squeeze(join(out, file));

@@ -78,7 +78,6 @@ export class App {
     this.canvas.parentElement!.append(this.marks.element);
     this.listen();
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
-    this.tell({ kind: 'start', origin: location.origin, scan: this.state.scan ?? 'latest' });
     void this.refreshScans();
     void this.refreshCapture();
     setInterval(() => void this.refreshCapture(), CAPTURE_MS);

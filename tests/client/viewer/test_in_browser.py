@@ -52,6 +52,18 @@ def test_a_click_sharpens_what_it_is_at(browser: Browser, node: RunningNode) -> 
     assert psnr(sharp, full) >= psnr(coarse, full) + 6
 
 
+def test_nothing_is_seen_through_a_surface_come_near(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        page.locator("#view").focus()
+        for key in (*"+++++", "Enter", "-", "-", "ArrowUp", "+", "+", "+"):
+            page.keyboard.press(key)
+            wait_drawn(page)
+        page.get_by_label("Surface").evaluate("(one) => (one.closest('details').open = true)")
+        page.get_by_label("Surface").select_option("relief")
+        wait_updates(page, 1)
+        assert crop(page, 0.5, 0.5, 260).min(axis=2).min() > 25, "the dark inside of the object shows"
+
+
 def test_distances_are_true_within_one_percent(browser: Browser, node: RunningNode) -> None:
     with opened(browser, node.url) as page:
         click(page, 0.5, 0.5)

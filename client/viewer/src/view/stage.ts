@@ -15,6 +15,8 @@ import type { Detail } from './tiles.ts';
 
 const HARDWARE: Detail = { cellPx: 2, trianglesMax: 3e6 };
 const SOFTWARE: Detail = { cellPx: 7, trianglesMax: 1.5e5 };
+/** Drawn larger than shown, so that edges are smooth. */
+const SMOOTH_RATIO = 1.5;
 const SLOW_FRAME_MS = 40;
 const QUICK_FRAME_MS = 22;
 const PACE_MAX = 6;
@@ -46,6 +48,8 @@ export class Stage {
   private readonly camera = new PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 1, 1000);
   private readonly controls: OrbitControls;
   private surface: Surface | null = null;
+  /** Replaced by the one above; kept until that is drawn, because they share compiled programs. */
+  private readonly retired: Surface[] = [];
   private shading: Shading = 'lit';
   private overlay: Channel | null = null;
   private asked = false;
@@ -55,8 +59,8 @@ export class Stage {
   private settling: ReturnType<typeof setTimeout> | undefined;
 
   constructor(private readonly canvas: HTMLCanvasElement, private readonly events: StageEvents, calm: boolean) {
-    this.software = drawsInSoftware(canvas);
-    this.renderer = new WebGLRenderer({ canvas, alpha: true, antialias: !this.software, powerPreference: 'high-performance' });
+    this.renderer = new WebGLRenderer({ canvas, alpha: true, powerPreference: 'high-performance' });
+    this.software = drawsInSoftware(this.renderer.getContext());
     this.renderer.setClearColor(0, 0);
     this.controls = new OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: !calm, dampingFactor: 0.12, zoomToCursor: true, rotateSpeed: 0.7 });
@@ -71,6 +75,7 @@ export class Stage {
     canvas.addEventListener('webglcontextrestored', () => this.events.restored());
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement!);
     this.resize();
+    this.show(nothing(), false);
   }
 
   /** Show a scan. framed: with the camera where it sees everything; else it stays. */
@@ -81,7 +86,7 @@ export class Stage {
     this.scene.add(this.surface.object);
     if (old) {
       this.scene.remove(old.object);
-      old.dispose();
+      this.retired.push(old);
     }
     if (framed) this.frame();
     this.draw();
@@ -236,6 +241,7 @@ export class Stage {
     const ratio = this.renderer.getPixelRatio();
     const triangles = this.surface?.prepare(this.camera, this.canvas.clientHeight * ratio, detail) ?? 0;
     this.renderer.render(this.scene, this.camera);
+    for (const old of this.retired.splice(0)) old.dispose();
     const { dataset } = this.canvas;
     dataset['drawn'] = String(Number(dataset['drawn'] ?? 0) + 1);
     dataset['triangles'] = String(triangles);
@@ -276,18 +282,25 @@ export class Stage {
 
   private resize(): void {
     const { clientWidth, clientHeight } = this.canvas.parentElement!;
-    this.renderer.setPixelRatio(this.software ? 1 : Math.min(window.devicePixelRatio, 2));
+    this.renderer.setPixelRatio(this.software ? 1 : Math.min(Math.max(window.devicePixelRatio, SMOOTH_RATIO), 2));
     this.renderer.setSize(Math.max(1, clientWidth), Math.max(1, clientHeight), false);
     this.camera.aspect = Math.max(1, clientWidth) / Math.max(1, clientHeight);
     this.draw();
   }
 }
 
-function drawsInSoftware(canvas: HTMLCanvasElement): boolean {
-  const probe = document.createElement('canvas').getContext('webgl2');
-  if (!probe) throw new Error(`no WebGL 2 for ${canvas.id}`);
-  const named = probe.getExtension('WEBGL_debug_renderer_info');
-  const name = String(probe.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : probe.RENDERER));
-  probe.getExtension('WEBGL_lose_context')?.loseContext();
+/** Whether the processor draws, because there is no graphics card. */
+function drawsInSoftware(context: WebGLRenderingContext | WebGL2RenderingContext): boolean {
+  const named = context.getExtension('WEBGL_debug_renderer_info');
+  const name = String(context.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : context.RENDERER));
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
+/** The smallest scan: drawn before the first real one, so that the card has compiled everything when that comes. */
+function nothing(): Snapshot {
+  const info = {
+    id: '', width: 8, height: 8, textureWidth: 16, textureHeight: 16, coarseWidth: 1, coarseHeight: 1, coarseTextureWidth: 1,
+    coarseTextureHeight: 1, stepMm: 1, pitchMm: 1, zMaxMm: 4, theta0Rad: 0,
+  };
+  return { info, steps: new Uint16Array(64).fill(1), coarseTexels: new Uint8Array(4), levels: [new Uint8Array(1), new Uint8Array(1)] };
 }

@@ -68,10 +68,10 @@ export class Surface {
       uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
       uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
     };
-    this.meshes = STRIDES.map((stride) => tileMesh(stride, this.uniforms));
+    this.tiles = new Tiles(info);
+    this.meshes = STRIDES.map((stride) => tileMesh(stride, this.tiles.count, this.uniforms));
     this.object.add(...this.meshes);
     this.normalPass = quadPass(this.uniforms, this.levels[0]);
-    this.tiles = new Tiles(info);
     this.tiles.update(this.steps, snapshot.levels[0]);
     this.drawNormals({ x: 0, y: 0, width, height });
   }
@@ -222,11 +222,15 @@ function shrink(cells: Uint8Array, x: number, y: number, width: number, height: 
   return { cells: small, x: left, y: top, width: right - left + 1, height: bottom - top + 1 };
 }
 
-function tileMesh(stride: number, shared: Uniforms): Mesh<InstancedBufferGeometry, ShaderMaterial> {
+function tileMesh(stride: number, tiles: number, shared: Uniforms): Mesh<InstancedBufferGeometry, ShaderMaterial> {
   const geometry = new InstancedBufferGeometry();
   const { position, index } = tileGrid(TILE / stride);
   geometry.setAttribute('position', position);
   geometry.setIndex(index);
+  // Room for all tiles at once: three.js never takes notice of a larger buffer.
+  for (const [name, each] of [['tile', 2], ['edges', 4]] as const) {
+    geometry.setAttribute(name, new InstancedBufferAttribute(new Float32Array(tiles * each), each).setUsage(DynamicDrawUsage));
+  }
   geometry.instanceCount = 0;
   const material = new ShaderMaterial({
     vertexShader: SURFACE_VERTEX, fragmentShader: SURFACE_FRAGMENT, glslVersion: GLSL3, side: DoubleSide, blending: NoBlending,
@@ -252,22 +256,11 @@ function tileGrid(cells: number): { position: BufferAttribute; index: BufferAttr
 }
 
 function fill(geometry: InstancedBufferGeometry, corners: number[], edges: number[]): void {
-  const count = corners.length / 2;
-  geometry.instanceCount = count;
-  if (!count) return;
-  const room = (geometry.getAttribute('tile') as BufferAttribute | undefined)?.count ?? 0;
-  if (room < count) {
-    const size = Math.max(count, 2 * room, 16);
-    for (const [name, each] of [['tile', 2], ['edges', 4]] as const) {
-      const attribute = new InstancedBufferAttribute(new Float32Array(size * each), each);
-      attribute.setUsage(DynamicDrawUsage);
-      geometry.setAttribute(name, attribute);
-    }
-  }
+  geometry.instanceCount = corners.length / 2;
   for (const [name, values] of [['tile', corners], ['edges', edges]] as const) {
     const attribute = geometry.getAttribute(name) as InstancedBufferAttribute;
     (attribute.array as Float32Array).set(values);
-    attribute.needsUpdate = true;
+    attribute.needsUpdate = values.length > 0;
   }
 }
 

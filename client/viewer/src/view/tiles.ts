@@ -48,6 +48,10 @@ export class Tiles {
     }
   }
 
+  get count(): number {
+    return this.tiles.length;
+  }
+
   /** Look again where tiles lie and what they hold. level: of 8 x 8 blocks. */
   update(steps: Uint16Array, level: Uint8Array): void {
     const { width, height, stepMm, pitchMm, zMaxMm, theta0Rad } = this.info;
