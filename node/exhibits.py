@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar, overload
 
 from node.classic import ClassicView, build_classic_view
-from node.first_view import FirstView, build_first_view
+from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.library import Library, Scan
 from node.texture_model import TextureModel
 from protocol.errors import LibraryError
@@ -56,7 +56,8 @@ class Exhibits:
         except LibraryError:
             self._views.pop(key, None)
             raise
-        self._survey(scan)
+        if isinstance(view, FirstView):
+            self._survey(scan, view)
         return scan, view
 
     def texture_model(self, scan: Scan) -> TextureModel | None:
@@ -80,13 +81,16 @@ class Exhibits:
         self._surveyor.shutdown(cancel_futures=True)
         self._pool.shutdown(cancel_futures=True)
 
-    def _survey(self, scan: Scan) -> None:
+    def _survey(self, scan: Scan, view: FirstView) -> None:
         """Have the scan's texture measured, one scan at a time, beside everything else."""
         if scan.id not in self._models:
-            self._models[scan.id] = self._surveyor.submit(TextureModel, scan.texture, self._closing.is_set)
+            self._models[scan.id] = self._surveyor.submit(self._model, scan, view)
             while len(self._models) > MODELS_MAX:
                 self._models.popitem(last=False)[1].cancel()
         self._models.move_to_end(scan.id)
+
+    def _model(self, scan: Scan, view: FirstView) -> TextureModel:
+        return TextureModel(scan.texture, texture_as_seen(view), self._closing.is_set)
 
     def _build(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening:
         scan = self.library.open(scan_id)

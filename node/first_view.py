@@ -14,14 +14,16 @@ from protocol.codec import (
     RangeCodec,
     TextureCodec,
     decode_range,
+    decode_texture,
     encode_mask,
     encode_range,
     encode_texture,
 )
 from protocol.errors import CodecError
-from protocol.grid import VOID
+from protocol.grid import VOID, ImageArray
 from protocol.lattice import Channel
 from protocol.messages import CodecName, ScanInfo
+from protocol.reconstruct import coarse_to_texture
 from protocol.refinement import CRC, HEADER, Generator, Refinement
 
 QUANTUM_MM = 0.05
@@ -61,6 +63,16 @@ def build_first_view(scan: Scan, codec: CodecName, max_bytes: int) -> FirstView:
     sent = decode_range(payload, RangeCodec.HTJ2K, coarse.filled.shape, quantum)
     sent[~coarse.measured] = VOID
     return FirstView(scan_info(scan), view, _texture(scan, codec, left), first_state(scan, sent))
+
+
+def texture_as_seen(view: FirstView) -> ImageArray:
+    """The dense texture that a client makes of a first view. (Ht, Wt, 3) uint8"""
+    shape = view.state.shapes[Channel.TEXTURE]
+    coarse_shape = shape.coarse_height, shape.coarse_width
+    sent = view.texture
+    return coarse_to_texture(
+        decode_texture(sent.payload, TextureCodec(sent.codec), sent.quality, coarse_shape), shape
+    )
 
 
 def scan_info(scan: Scan) -> ScanInfo:

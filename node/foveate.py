@@ -53,6 +53,7 @@ from protocol.region import Region, region_round
 REPLY_BYTES = 220  # the Updated message that ends an update, carrier included
 RANGE_OVERHEAD_BYTES = wire_overhead(Parameters(2, 0, 0, 1, 1)) + 64  # a void mask included
 TEXTURE_BYTES_MIN = 128  # for less, no texture is tried
+HELD_MARGIN = 0.95  # what is held is known block by block, not texel by texel
 RANGE_MARGIN = 1.1  # expectations of range are a tenth off
 DOUBLINGS_MAX = 6
 NO_TEXTURE = 8.0  # doublings of error that an update without texture falls short by
@@ -225,6 +226,9 @@ class _Planner:
         """The cheapest refinement within limit_bytes that reaches the quality, else the best one that fits."""
         if limit_bytes < TEXTURE_BYTES_MIN:
             self._limited = True
+            return None
+        if self._model is not None and (held := self._texture_error(None)) <= HELD_MARGIN * self._target_mse:
+            self._texture_db = db_of_mse(held)
             return None
         finest = choose_spacing(self._scan, self._state, self._texture_region, self._look.texture_db, self._codec)
         for p in (spacing for spacing in reversed(SPACINGS) if spacing >= finest):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.codec import LOSSLESS, TextureCodec, decode_texture, encode_texture
 from protocol.grid import FloatArray, ImageArray, IntArray
@@ -73,22 +74,29 @@ class TextureModel:
     """Expected bytes and error of any region of one scan's texture, at spacing 1. Safe to use from several threads.
 
     texture : (Ht, Wt, 3) uint8 RGB; coded whole, once, in the calling thread.
+    first_view : the same as a client sees it that has nothing else; None: as bad as can be.
     unwanted : asked between tiles; when true, the work is dropped and CancelledError raised.
     """
 
-    def __init__(self, texture: ImageArray, unwanted: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        texture: ImageArray,
+        first_view: ImageArray | None = None,
+        unwanted: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._shape = texture.shape[:2]
         rows, columns = (-(-size // TILE) for size in self._shape)
         self._bytes = np.empty((len(QUALITIES), rows, columns))
         cells = tuple(-(-size // CELL) for size in self._shape)
         self._mse = np.empty((len(QUALITIES), *cells), np.float32)
+        self._first_mse = np.full(cells, 255.0**2, np.float32)
         self._bias = {TextureCodec.HTJ2K: 1.0, TextureCodec.JPEG: JPEG_BIAS}
         self._lock = threading.Lock()
         for row in range(rows):
             for column in range(columns):
                 if unwanted():
                     raise CancelledError
-                self._measure(texture, row, column)
+                self._measure(texture, first_view, row, column)
 
     def expect(self, region: Region, codec: TextureCodec) -> Expected:
         """What the blocks that a region touches will take and reach."""
@@ -100,12 +108,12 @@ class TextureModel:
         return Expected(np.log(np.maximum(mse, MSE_MIN)), np.log(np.maximum(size_bytes, 1.0)))
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
-        """Squared error per value of single blocks at qualities of their own. (n,) each"""
+        """Squared error per value of single blocks at qualities of their own; -1 is the first view. (n,) each"""
         scale = np.array(QUALITIES, np.float64)
         above = np.clip(np.searchsorted(scale, quality), 1, scale.size - 1)
         part = np.clip((quality - scale[above - 1]) / (scale[above] - scale[above - 1]), 0, 1)
         low, high = (np.log(np.maximum(self._mse[index, rows, columns], MSE_MIN)) for index in (above - 1, above))
-        return np.asarray(np.exp(low + part * (high - low)))
+        return np.where(quality < 0, self._first_mse[rows, columns], np.exp(low + part * (high - low)))
 
     def learn(self, codec: TextureCodec, expected_bytes: float, actual_bytes: int) -> None:
         """Take note of what a patch really took."""
@@ -114,18 +122,19 @@ class TextureModel:
                 ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
                 self._bias[codec] *= ratio**BIAS_WEIGHT
 
-    def _measure(self, texture: ImageArray, row: int, column: int) -> None:
+    def _measure(self, texture: ImageArray, first_view: ImageArray | None, row: int, column: int) -> None:
         """Code one tile at every quality."""
-        tile = np.ascontiguousarray(texture[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE])
-        height, width = tile.shape[:2]
-        cells = -(-width // CELL), -(-height // CELL)
+        place = slice(row * TILE, (row + 1) * TILE), slice(column * TILE, (column + 1) * TILE)
+        tile = np.ascontiguousarray(texture[place])
         y, x = row * TILE // CELL, column * TILE // CELL
+        cells = slice(y, y - (-tile.shape[0] // CELL)), slice(x, x - (-tile.shape[1] // CELL))
+        if first_view is not None:
+            self._first_mse[cells] = _cell_errors(tile, np.ascontiguousarray(first_view[place]))
         for index, quality in enumerate(QUALITIES):
             payload = encode_texture(tile, TextureCodec.HTJ2K, quality)
-            missed = cv2.absdiff(tile, decode_texture(payload, TextureCodec.HTJ2K, quality, (height, width)))
-            squared = cv2.resize(cv2.multiply(missed, missed, dtype=cv2.CV_32F), cells, interpolation=cv2.INTER_AREA)
             self._bytes[index, row, column] = max(len(payload) - TILE_OVERHEAD_BYTES, 1)
-            self._mse[index, y : y + cells[1], x : x + cells[0]] = squared.reshape(cells[1], cells[0], 3).mean(axis=2)
+            decoded = decode_texture(payload, TextureCodec.HTJ2K, quality, (tile.shape[0], tile.shape[1]))
+            self._mse[(index, *cells)] = _cell_errors(tile, decoded)
 
     def _share_of_tiles(self, left: int, top: int, width: int, height: int) -> FloatArray:
         """How much of each tile a rectangle covers, 0..1, cyclic in x."""
@@ -135,6 +144,16 @@ class TextureModel:
         if left + width > turn:
             columns = columns + _overlap(0, left + width - turn, self._bytes.shape[2], turn)
         return np.asarray(np.multiply.outer(rows, columns))
+
+
+def _cell_errors(tile: ImageArray, other: ImageArray) -> NDArray[np.float32]:
+    """Squared error per value in each 16 x 16 cell of a tile."""
+    missed = cv2.absdiff(tile, other)
+    rows, columns = -(-tile.shape[0] // CELL), -(-tile.shape[1] // CELL)
+    squared = cv2.resize(
+        cv2.multiply(missed, missed, dtype=cv2.CV_32F), (columns, rows), interpolation=cv2.INTER_AREA
+    )
+    return np.asarray(squared.reshape(rows, columns, 3).mean(axis=2), np.float32)
 
 
 def _overlap(start: int, length: int, tiles: int, size: int) -> FloatArray:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from client.model import Model
-from node.first_view import FirstView, build_first_view
+from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.foveate import REPLY_BYTES, Update, plan_update
 from node.library import Scan
 from node.state import ClientState
@@ -39,8 +39,8 @@ def view(scan: Scan) -> FirstView:
 
 
 @pytest.fixture(scope="module")
-def model_of_texture(scan: Scan) -> TextureModel:
-    return TextureModel(scan.texture)
+def model_of_texture(scan: Scan, view: FirstView) -> TextureModel:
+    return TextureModel(scan.texture, texture_as_seen(view))
 
 
 class Viewer:
@@ -264,3 +264,15 @@ def test_noise_reaches_the_quality_asked_for(tmp_path: Path, target_db: float) -
     look = Look(1, 0.5, 0.5, texture_db=target_db)
     viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=TextureModel(scan.texture)))
     assert viewer.texture_db(look) >= target_db - 0.01
+
+
+def test_texture_that_the_first_view_shows_well_enough_is_not_sent(
+    scan: Scan, view: FirstView, model_of_texture: TextureModel
+) -> None:
+    viewer = Viewer(scan, view)
+    look = Look(1, 0.2, 0.5, texture_db=30)
+    update = plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture)
+    assert [coded.channel for coded in update.coded] == [Channel.RANGE]
+    assert update.texture_db == pytest.approx(viewer.texture_db(look), abs=0.3)
+    assert viewer.texture_db(look) >= look.texture_db
+    assert plan_update(scan, viewer.state, look, "htj2k").coded[-1].channel is Channel.TEXTURE  # not known yet: sent
