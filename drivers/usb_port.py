@@ -229,7 +229,7 @@ def _find(address: UsbAddress, backend: Any) -> Any:
     """The device at an address. Raises PortLost."""
     backend = backend or usb.backend.libusb1.get_backend()
     if backend is None:
-        raise PortLost(f"{address}: libusb is not installed; as root: apt-get install libusb-1.0-0")
+        raise PortLost(f"{address}: no USB here: libusb is not installed (libusb-1.0-0), or the machine has no bus")
     try:
         found = list(usb.core.find(True, backend=backend, idVendor=address.vendor, idProduct=address.product))
         chosen = [device for device in found if _has_serial(device, address.serial_number)]

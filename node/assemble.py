@@ -121,6 +121,17 @@ class Assembler:
         """Take rows row0... of the texture column at an encoder count, as for range. samples : (n, 3) uint8 RGB."""
         self._texture.add(self._encoder.tick(encoder_count), row0, samples)
 
+    def with_texture_of(self, other: Assembler) -> Assembler:
+        """The range columns of this sweep and the texture columns of another one, put together by the encoder.
+
+        Raises ValueError when the two do not describe the same grid on the same table.
+        """
+        if other._spec != self._spec or other._encoder.counts_per_turn != self._encoder.counts_per_turn:
+            raise ValueError("a texture-only sweep goes with a range-only sweep of the same grid and table")
+        both = Assembler(self._spec, self._encoder)
+        both._range, both._texture = self._range, other._texture
+        return both
+
     def missing_range(self) -> IntArray:
         """Range columns of the grid that nothing complete stands at or close enough round. (n,) ascending."""
         return self._range.folded(self._encoder.counts_per_turn).missing
