@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from typing import TYPE_CHECKING, Any
 
 from client import exchange_command, scan_command
+from client.arguments import add_node, add_search, no_node, node_url, number
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ CENTRE = (0.5, 0.5)
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `discover`, `scan`, `export`, `import` and `look`."""
     finder = subparsers.add_parser("discover", help="list the nodes on this network")
-    _add_common(finder)
+    add_search(finder)
     finder.add_argument("--name", help="stop at the node of this name or id")
     finder.set_defaults(run=run_discover)
 
@@ -31,17 +31,15 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     exchange_command.add_subcommands(subparsers)
 
     looker = subparsers.add_parser("look", help="open a scan and get detail where you look")
-    _add_common(looker)
-    looker.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
-    looker.add_argument("--token", help="what the node was paired with")
+    add_node(looker)
     looker.add_argument("--scan", default="latest", metavar="ID", help="which scan (latest)")
     looker.add_argument(
         "--at", type=_click, nargs="+", action="extend", metavar="U,V", help="where to look, each in [0, 1) (0.5,0.5)"
     )
-    looker.add_argument("--window", type=_number, default=0.05, metavar="SHARE", help="share of the area, 0..1 (0.05)")
-    looker.add_argument("--texture-db", type=_number, default=40, metavar="DB", help="PSNR to stop at (40)")
-    looker.add_argument("--range-mm", type=_number, default=0.1, metavar="MM", help="range error to stop at (0.1)")
-    looker.add_argument("--max-wait", type=_number, metavar="S", help="seconds a look may take")
+    looker.add_argument("--window", type=number, default=0.05, metavar="SHARE", help="share of the area, 0..1 (0.05)")
+    looker.add_argument("--texture-db", type=number, default=40, metavar="DB", help="PSNR to stop at (40)")
+    looker.add_argument("--range-mm", type=number, default=0.1, metavar="MM", help="range error to stop at (0.1)")
+    looker.add_argument("--max-wait", type=number, metavar="S", help="seconds a look may take")
     looker.add_argument("--max-bytes", type=int, metavar="N", help="bytes a look may take")
     looker.add_argument(
         "--profile", choices=["default", "classic"], default="default", help="default, or the paper's letter"
@@ -62,7 +60,7 @@ def run_discover(args: argparse.Namespace) -> int:
     for node in nodes:
         _print(args, _node_record(node), f"{node.url}  {printable(node.name)}  {node.state}")
     if not nodes:
-        raise _no_node(args.timeout)
+        raise no_node(args.timeout)
     return 0
 
 
@@ -83,7 +81,7 @@ async def _look(args: argparse.Namespace) -> None:
 
     clicks = args.at or [CENTRE]
     with _progress(args, 1 + len(clicks), "looking") as bar:
-        async with connect(args.node or await only_node(args.timeout), token=args.token) as session:
+        async with connect(await node_url(args), token=args.token) as session:
             model = await session.open(args.scan, profile=args.profile)
             bar.update()
             s = model.info
@@ -109,25 +107,6 @@ async def _look_at(session: Session, args: argparse.Namespace, u: float, v: floa
         max_wait_s=args.max_wait,
         max_bytes=args.max_bytes,
     )
-
-
-async def only_node(timeout_s: float) -> NodeAddress:
-    """The one node on this network. Raises NodeLost when none answers within timeout_s, or several do."""
-    from client.discovery import discover
-    from client.errors import NodeLost
-
-    nodes = await discover(timeout_s)
-    if not nodes:
-        raise _no_node(timeout_s)
-    if len(nodes) > 1:
-        raise NodeLost(f"{len(nodes)} nodes answer; choose one: --node {' or '.join(node.url for node in nodes)}")
-    return nodes[0]
-
-
-def _no_node(timeout_s: float) -> Exception:
-    from client.errors import NodeLost
-
-    return NodeLost(f"no node answered within {timeout_s:g} s; start one with `foveascan serve` or use --node")
 
 
 def _node_record(node: NodeAddress) -> dict[str, Any]:
@@ -169,33 +148,11 @@ def _progress(args: argparse.Namespace, total: int, what: str) -> tqdm[Any]:
     return tqdm(total=total, desc=what, leave=False, disable=True if args.json else None)
 
 
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
-    parser.add_argument("--timeout", type=_seconds, default=3.0, metavar="S", help="seconds to search for nodes (3)")
-
-
 def _click(text: str) -> tuple[float, float]:
     u, separator, v = text.partition(",")
     if not separator:
         raise argparse.ArgumentTypeError(f"expected U,V, got {text!r}")
-    click = _number(u), _number(v)
+    click = number(u), number(v)
     if not all(0 <= coordinate < 1 for coordinate in click):
         raise argparse.ArgumentTypeError(f"u and v must be in [0, 1), got {text}")
     return click
-
-
-def _number(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f"expected a number, got {text!r}")
-    return number
-
-
-def _seconds(text: str) -> float:
-    seconds = _number(text)
-    if not 0 < seconds <= 3600:
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text}")
-    return seconds

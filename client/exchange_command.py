@@ -8,18 +8,14 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from client.arguments import add_node, node_url, number, positive
 
 if TYPE_CHECKING:
     from client.transfer import Moved
     from exchange.formats import MeshOptions, Size
     from protocol.grid import Grid
-
-SIZES = {
-    "S": (360, 100, 1024, 256),
-    "M": (1440, 1024, 4096, 2048),
-    "L": (4096, 2048, 8192, 4096),
-}
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,7 +23,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     export = subparsers.add_parser("export", help="write a node's scan to a file: .glb, .ply, .obj.zip, .stl or .npz")
     export.add_argument("file", type=Path, help="what to write; the suffix is the format")
     export.add_argument("--scan", default="latest", metavar="ID", help="which scan (latest)")
-    _add_node(export)
+    add_node(export)
     export.set_defaults(run=run_export)
 
     bring = subparsers.add_parser("import", help="bring a grid, a mesh or a Cyberware Echo file to a node as a scan")
@@ -36,7 +32,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     bring.add_argument("--name", help="what to call it (the file's own name)")
     bring.add_argument("-o", "--output", type=Path, metavar="GRID", help="write a .npz grid instead of sending it")
     _add_mesh(bring)
-    _add_node(bring)
+    add_node(bring)
     bring.set_defaults(run=run_import)
 
 
@@ -76,7 +72,7 @@ def run_import(args: argparse.Namespace) -> int:
 async def _export(args: argparse.Namespace) -> int:
     from client.transfer import fetch_scan
 
-    url = await _node_url(args)
+    url = await node_url(args)
     with _bar(args, "fetching") as moved:
         return await fetch_scan(url, args.scan, args.file, token=args.token, moved=moved)
 
@@ -87,7 +83,7 @@ async def _import(args: argparse.Namespace, name: str, grid: Grid) -> str:
     from client.transfer import send_scan
     from exchange.native import write_native
 
-    url = await _node_url(args)
+    url = await node_url(args)
     with tempfile.TemporaryFile() as file, _bar(args, "sending") as moved:
         write_native(grid, file, name)
         return await send_scan(url, file, token=args.token, moved=moved)
@@ -102,12 +98,6 @@ def _write(path: Path, name: str, grid: Grid) -> None:
         raise ExchangeError(f"{path}: only .npz is written here; send it to a node and use `foveascan export`")
     with whole_file(path) as file:
         write_native(grid, file, name)
-
-
-async def _node_url(args: argparse.Namespace) -> str:
-    from client.command import only_node
-
-    return args.node.rstrip("/") if args.node else (await only_node(args.timeout)).url
 
 
 def _mesh_options(args: argparse.Namespace) -> MeshOptions:
@@ -132,25 +122,20 @@ def _bar(args: argparse.Namespace, what: str) -> Iterator[Moved]:
         yield moved
 
 
-def _add_node(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
-    parser.add_argument("--token", help="what the node was paired with")
-    parser.add_argument("--timeout", type=float, default=3.0, metavar="S", help="seconds to search for nodes (3)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-
-
 def _add_mesh(parser: argparse.ArgumentParser) -> None:
     mesh = parser.add_argument_group("meshes", "what a mesh does not say itself")
     mesh.add_argument(
-        "--size", type=_size, default=SIZES["M"], metavar="S|M|L|WxH:WtxHt", help="samples and texels (M)"
+        "--size", type=_size, default="M", metavar="S|M|L|WxH:WtxHt", help="samples and texels (M)"
     )
     mesh.add_argument("--up", choices=("z", "y", "x", "-z", "-y", "-x"), help="the axis that points up (z; glTF: y)")
-    mesh.add_argument("--unit-mm", type=_positive, metavar="MM", help="millimetres of its unit (1; glTF: 1000)")
+    mesh.add_argument("--unit-mm", type=positive, metavar="MM", help="millimetres of its unit (1; glTF: 1000)")
     mesh.add_argument("--centre", action="store_true", help="put its middle on the turntable's axis")
-    mesh.add_argument("--theta0-deg", type=float, default=0.0, metavar="DEG", help="angle of the seam (0)")
+    mesh.add_argument("--theta0-deg", type=number, default=0.0, metavar="DEG", help="angle of the seam (0)")
 
 
 def _size(text: str) -> Size:
+    from exchange.formats import SIZES
+
     if text in SIZES:
         return SIZES[text]
     numbers = text.replace(":", "x").split("x")
@@ -158,10 +143,3 @@ def _size(text: str) -> Size:
         raise argparse.ArgumentTypeError(f"expected S, M, L or WxH:WtxHt, got {text!r}")
     width, height, texture_width, texture_height = map(int, numbers)
     return width, height, texture_width, texture_height
-
-
-def _positive(text: str) -> float:
-    value: Any = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
-    return float(value)

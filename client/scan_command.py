@@ -6,6 +6,8 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
+from client.arguments import add_node, node_url
+
 if TYPE_CHECKING:
     from client.session import Session
 
@@ -15,10 +17,7 @@ POLL_S = 0.2
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `scan`."""
     scan = subparsers.add_parser("scan", help="start a sweep and wait until the scan is published")
-    scan.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
-    scan.add_argument("--token", help="what the node was paired with")
-    scan.add_argument("--timeout", type=float, default=3.0, metavar="S", help="seconds to search for nodes (3)")
-    scan.add_argument("--json", action="store_true", help="print one JSON object")
+    add_node(scan)
     scan.set_defaults(run=run_scan)
 
 
@@ -32,10 +31,9 @@ def run_scan(args: argparse.Namespace) -> int:
 
 
 async def _scan(args: argparse.Namespace) -> str:
-    from client.command import only_node
     from client.session import connect
 
-    async with connect(args.node or await only_node(args.timeout), token=args.token) as session:
+    async with connect(await node_url(args), token=args.token) as session:
         return await _sweep(session, silent=args.json)
 
 

@@ -7,5 +7,5 @@
     echo        Cyberware Echo range images
     image, whole_file, errors
 
-Node, client and simulators share it; it knows neither of them, nor any wire.
+Node, client and simulators share it; it knows none of them, nor any wire.
 """

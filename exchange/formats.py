@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from exchange.mesh_file import Placing
 
 Writer = Callable[[Grid, BinaryIO], None]
-Size = tuple[int, int, int, int]
+Size = tuple[int, int, int, int]  # W, H, Wt, Ht
 
 MEDIA_TYPES: Mapping[str, str] = MappingProxyType(
     {
@@ -27,14 +27,20 @@ MEDIA_TYPES: Mapping[str, str] = MappingProxyType(
     }
 )
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".bmp")
-DEFAULT_SIZE: Size = (1440, 1024, 4096, 2048)
+SIZES: Mapping[str, Size] = MappingProxyType(
+    {
+        "S": (360, 100, 1024, 256),
+        "M": (1440, 1024, 4096, 2048),
+        "L": (4096, 2048, 8192, 4096),
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
 class MeshOptions:
     """What a mesh does not say itself. size : W, H, Wt, Ht.  placing : None: as its format demands.  See fit_spec."""
 
-    size: Size = DEFAULT_SIZE
+    size: Size = SIZES["M"]
     placing: Placing | None = None
     theta0_rad: float = 0.0
 

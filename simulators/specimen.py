@@ -14,20 +14,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from exchange.formats import MeshOptions, read_scan
+from exchange.formats import SIZES, MeshOptions, read_scan
 from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from simulators import shapes
 from simulators.head import head
 from simulators.nutcracker import nutcracker
 
-SIZES: Mapping[str, shapes.Shape] = MappingProxyType(
-    {
-        "S": (360, 100, 1024, 256),
-        "M": (1440, 1024, 4096, 2048),
-        "L": (4096, 2048, 8192, 4096),
-    }
-)
 GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType(
     {
         "sphere": shapes.sphere,

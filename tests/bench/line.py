@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from client.model import Model
+from exchange.formats import SIZES
 from node.assemble import Assembler, Encoder
 from node.coarse import build_coarse, build_pyramid, fill_voids
 from node.first_view import FirstView, build_first_view
@@ -41,7 +42,7 @@ from protocol.messages import (
 from protocol.reconstruct import select
 from protocol.refinement import Refinement
 from protocol.region import region_round
-from simulators.specimen import GENERATORS, SIZES
+from simulators.specimen import GENERATORS
 from tests.bench.scans import REAL, BenchScan, Skipped, load
 from tests.bench.timing import MEGABYTE, medians_s
 

@@ -173,10 +173,28 @@ def test_a_sweep_that_fails_says_why() -> None:
         run("scan", "--node", url)
 
 
+def test_trouble_of_an_earlier_sweep_is_not_taken_for_this_one_s(capsys: pytest.CaptureFixture[str]) -> None:
+    old = {"phase": "ready", "why": "sweep interrupted: the port is gone"}
+    table = Turntable(old, {"phase": "starting"}, {"phase": "sweeping"}, {"phase": "ready", "sweeps": 1})
+    with serving_in_thread(table.announce, *table.routes()) as url:
+        assert run("scan", "--node", url, "--json") == 0
+    assert json_lines(capsys.readouterr().out) == [{"scan": "fresh"}]
+
+
 def test_a_node_without_a_scanner_is_named() -> None:
     table = Turntable({"phase": "no scanner"})
     with serving_in_thread(greet_and_wait, *table.routes()) as url, pytest.raises(ScannerFault, match="--scanner"):
         run("scan", "--node", url)
+
+
+@pytest.mark.parametrize("command", [("discover",), ("look",), ("scan",), ("export", "x.glb"), ("import", "x.npz")])
+@pytest.mark.parametrize("timeout", ["0", "-1", "nan", "inf", "3601", "soon"])
+def test_every_command_checks_how_long_to_search(
+    command: tuple[str, ...], timeout: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        run(*command, "--timeout", timeout)
+    assert end.value.code == 2 and "--timeout: expected" in capsys.readouterr().err
 
 
 async def greet_and_wait(line: Line) -> None:

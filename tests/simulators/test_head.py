@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from exchange.formats import SIZES
 from protocol.grid import VOID, Grid
 from simulators.head import head, relief_mm
 from simulators.marks import marks
 from simulators.sheet import range_sheet
-from simulators.specimen import SIZES
 
 
 @pytest.fixture(scope="module")

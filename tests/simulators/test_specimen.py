@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exchange.formats import SIZES
 from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, GridSpec
 from simulators import shapes
-from simulators.specimen import GENERATORS, SIZES, Specimen, make_specimen
+from simulators.specimen import GENERATORS, Specimen, make_specimen
 
 
 def tiny() -> Specimen:

@@ -1,0 +1,70 @@
+"""Arguments that several subcommands take: which node, checked numbers."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+TIMEOUT_MAX_S = 3600
+
+
+def add_search(parser: argparse.ArgumentParser) -> None:
+    """Offer --json and --timeout."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object a line")
+    parser.add_argument("--timeout", type=seconds, default=3.0, metavar="S", help="seconds to search for nodes (3)")
+
+
+def add_node(parser: argparse.ArgumentParser) -> None:
+    """Offer --node, --token, and what `add_search` does."""
+    add_search(parser)
+    parser.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
+    parser.add_argument("--token", help="what the node was paired with")
+
+
+async def node_url(args: argparse.Namespace) -> str:
+    """The URL that --node names, else that of the one node on this network. Raises NodeLost unless it is exactly one."""
+    if args.node:
+        return str(args.node.rstrip("/"))
+    from client.discovery import discover
+    from client.errors import NodeLost
+
+    nodes = await discover(args.timeout)
+    if not nodes:
+        raise no_node(args.timeout)
+    if len(nodes) > 1:
+        raise NodeLost(f"{len(nodes)} nodes answer; choose one: --node {' or '.join(node.url for node in nodes)}")
+    return nodes[0].url
+
+
+def no_node(timeout_s: float) -> Exception:
+    """Nobody answered in time, and the cure."""
+    from client.errors import NodeLost
+
+    return NodeLost(f"no node answered within {timeout_s:g} s; start one with `foveascan serve` or use --node")
+
+
+def number(text: str) -> float:
+    """A finite number. Raises ArgumentTypeError, here and below."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a number, got {text!r}")
+    return value
+
+
+def positive(text: str) -> float:
+    """A number above 0."""
+    value = number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
+    return value
+
+
+def seconds(text: str) -> float:
+    """A time to wait, above 0 and at most an hour. [s]"""
+    value = positive(text)
+    if value > TIMEOUT_MAX_S:
+        raise argparse.ArgumentTypeError(f"expected at most {TIMEOUT_MAX_S} seconds, got {text}")
+    return value
