@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -415,4 +416,12 @@ def _checked_look(look: m.Look) -> m.Look:
         plain = msgspec.to_builtins(look, enc_hook=float)  # numbers of numpy are numbers too
         return msgspec.convert(plain, m.Look)
     except (msgspec.ValidationError, TypeError, ValueError) as error:
-        raise LocalWireError(f"look: {error}") from None
+        raise LocalWireError(f"look: {_plainly(str(error))}") from None
+
+
+def _plainly(problem: str) -> str:
+    """A message of msgspec, place first, as the caller wrote it: "max_wait_s: expected float >= 0.05"."""
+    what, _, at = problem.partition(" - at ")
+    place = re.sub("[A-Z]", lambda letter: f"_{letter[0].lower()}", at.strip("`").removeprefix("$").removeprefix("."))
+    what = what.replace("`", "").replace("Expected", "expected")
+    return f"{place}: {what}" if place else what

@@ -12,7 +12,8 @@ import asyncio
 import errno
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import BinaryIO
 
 import msgspec
@@ -79,8 +80,16 @@ class ExchangeRoutes:
         except LibraryError as problem:
             raise web.HTTPInsufficientStorage(text=str(problem)) from problem
 
-    def _temporary(self) -> BinaryIO:
-        return tempfile.TemporaryFile(dir=self._exhibits.library.folder)
+    @contextmanager
+    def _temporary(self) -> Iterator[BinaryIO]:
+        """A nameless file on the library's disk. Raises an HTTP error where that is full, which may show at the end."""
+        try:
+            with tempfile.TemporaryFile(dir=self._exhibits.library.folder) as file:
+                yield file
+        except (ConnectionError, TimeoutError):
+            raise
+        except OSError as problem:
+            raise _disk_trouble(problem) from problem
 
 
 def _check_free(places: asyncio.Semaphore) -> None:

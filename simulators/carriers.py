@@ -261,11 +261,14 @@ def _write(port: ServedPort, data: bytes, portion_bytes: int) -> None:
 def _check_free(path: Path) -> None:
     """Raise FileExistsError where something stands that no scanner left behind."""
     if os.path.lexists(path) and not path.is_symlink():
-        raise FileExistsError(f"{path} exists and is no symbolic link")
+        raise FileExistsError(f"{path} exists and is no symbolic link; choose another path")
 
 
 def _replace_link(path: Path, target: str) -> None:
     """Make `path` a symbolic link to `target`, in one step."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    os.symlink(target, fresh)
-    os.replace(fresh, path)
+    try:
+        os.symlink(target, fresh)
+        os.replace(fresh, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error  # not what it leads to

@@ -390,6 +390,21 @@ BAD_LOOKS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no time", "max_wait_s: expected float >= 0.05"),
+        ("spacing that is none", "parameters.range.p: Invalid enum value 3"),
+    ],
+)
+async def test_a_look_out_of_bounds_is_named_as_the_caller_wrote_it(name: str, said: str) -> None:
+    async with session_with(show_and_answer) as session:
+        await session.open()
+        with pytest.raises(LocalWireError) as refused:
+            await session.look(**{"u": 0.5, "v": 0.5, **BAD_LOOKS[name]})
+        assert str(refused.value) == f"look: {said}"
+
+
 @pytest.mark.parametrize("change", BAD_LOOKS.values(), ids=BAD_LOOKS)
 async def test_a_look_out_of_bounds_is_refused_before_it_is_sent(change: dict[str, Any]) -> None:
     async with session_with(show_and_answer) as session:

@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -198,6 +199,19 @@ async def test_a_scan_without_a_surface_is_no_mesh_but_a_grid(tmp_path: Path) ->
         answer = await client.get(f"/v1/scans/{scan.id}.glb")
         assert answer.status == 422 and "nothing is measured" in await answer.text()
         assert (await client.get(f"/v1/scans/{scan.id}.npz")).status == 200
+
+
+async def test_a_disk_that_fills_up_while_a_file_is_made_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with serving(tmp_path) as (client, exhibits, _):
+        exhibits.library.add(vase(), About(0.0))
+        monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: open("/dev/full", "r+b"))
+        for answer in (
+            await client.get("/v1/scans/latest.glb"),
+            await client.post("/v1/scans", data=native(vase())),
+        ):
+            assert (answer.status, await answer.text()) == (507, "the node's disk is full")
 
 
 async def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

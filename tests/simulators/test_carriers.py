@@ -152,6 +152,12 @@ def test_serving_ends_though_nobody_reads(tmp_path: Path, monkeypatch: pytest.Mo
     here.end()
 
 
+def test_a_link_that_cannot_be_made_is_named_itself(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as refused:
+        PtyPort(tmp_path / "nowhere" / "scanner")
+    assert refused.value.filename == str(tmp_path / "nowhere" / "scanner")
+
+
 def test_a_link_left_behind_is_replaced_and_anything_else_is_not(tmp_path: Path) -> None:
     stale, file = tmp_path / "stale", tmp_path / "file"
     stale.symlink_to(tmp_path / "gone")
