@@ -22,7 +22,7 @@ def add_node(parser: argparse.ArgumentParser) -> None:
 
 
 async def node_url(args: argparse.Namespace) -> str:
-    """The URL that --node names, else that of the one node on this network. Raises NodeLost unless it is exactly one."""
+    """The URL that --node names, else that of the one node on this network. Raises NodeLost unless there is one."""
     if args.node:
         return str(args.node.rstrip("/"))
     from client.discovery import discover

@@ -50,7 +50,7 @@ CUT_SHORT = "the node was cut off in the middle of it"
 COMPLETE = "it is complete, and was not published yet"
 
 _MAGIC = b"FSj\x01"
-_RECORD = struct.Struct("<4sII")  # magic, length of the payload, CRC-32 of length and payload
+_RECORD = struct.Struct("<4sII")  # magic, length of the payload, CRC-32 of the payload begun at its length
 _MESSAGE = struct.Struct("<BH")  # type, length
 _BEGIN_TYPE = 0x00  # no message of the link
 _BEGIN = struct.Struct("<Hd")  # format, start by the node's clock

@@ -2,7 +2,8 @@
 
 Level: the smallest L with (widest sample interval)^2 <= 2^L; 0 = every sample. Rank: how good the values are, larger is
 better; range 65535 - quantisation step (the scan's own step is 65534), texture the quality 0..255 plus 1, and 0 for the
-first view. A covered block is adopted iff its level falls and its rank does not, or its rank rises at the same level.
+first view. A covered block is adopted iff its level falls and its rank does not, or its rank rises at the same level,
+by at least 1 for range and 3 for texture.
 
 Source: REQUIREMENTS F-09c.
 """
