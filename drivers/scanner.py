@@ -86,12 +86,13 @@ class Scanner:
         self._sweep = secrets.randbelow(65535)
         self._silent_s = 0.0
         self._frames_heard = 0
+        self._is_doubtful = False  # whether the last sweep broke
 
     def hello(self) -> DeviceInfo:
         """Open a session. Raises PortLost, or ScannerFault when nothing answers or it speaks another version."""
         session = 1 + secrets.randbelow(65535)
         config = self._config
-        self._info = None
+        self._info, self._is_doubtful = None, False
         link = ScannerLink(Role.HOST, session=session, payload_max=config.payload_max, window_bytes=config.window_bytes)
         self._link = link
         link.tick(self._clock())
@@ -112,8 +113,11 @@ class Scanner:
     def sweep(self, request: SweepRequest, stop: threading.Event | None = None) -> Generator[SweepEvent, None, None]:
         """One sweep, event by event; whatever the scanner was doing is dropped first. Setting `stop` ends it.
 
+        After a sweep that broke, the scanner is greeted first: it may have started anew and know us no longer.
         Raises PortLost or ScannerFault when it does not even start.
         """
+        if self._is_doubtful:
+            self.hello()
         self._sweep = self._sweep % 65535 + 1
         for command in (Reset(), request):
             self._command(command)
@@ -181,6 +185,7 @@ class Scanner:
     def _answering(self, outcomes: Iterator[SweepEvent]) -> Iterator[SweepEvent]:
         """The same events, each told to the caller after the scanner got its answer: the caller may not come back."""
         for outcome in outcomes:
+            self._is_doubtful |= isinstance(outcome, SweepInterrupted) and outcome.cause is not None
             self._flush()
             yield outcome
 

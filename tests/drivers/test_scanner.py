@@ -236,6 +236,17 @@ def test_a_silent_scanner_interrupts_the_sweep_after_the_quiet_time() -> None:
     assert 1.0 <= bench.port.clock() - silent_s[0] <= 1.5
 
 
+def test_a_scanner_that_started_anew_in_a_sweep_sweeps_again_without_being_asked_twice() -> None:
+    bench = greeted(config=ScannerConfig(quiet_s=1.0))
+
+    def start_anew(count: int, _: SweepEvent) -> None:
+        if count == 20:
+            bench.port._scanner = SimulatedScanner(Turntable(bench.specimen), boot_id=2)
+
+    assert isinstance(bench.sweep(at_event=start_anew), SweepInterrupted)
+    assert isinstance(bench.sweep(), SweepFinished) and bench.is_exact()
+
+
 def test_a_pulled_plug_interrupts_the_sweep_and_says_so() -> None:
     bench = greeted()
     last = bench.sweep(at_event=lambda count, _: bench.port.unplug() if count == 20 else None)

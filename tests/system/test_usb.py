@@ -27,7 +27,9 @@ def run_under_preload(root: Path, *arguments: str, timeout_s: float = 110) -> su
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("tests", ["test_fault_matrix.py -k usb-", "usb_emulated.py", "tty_emulated.py"])
+@pytest.mark.parametrize(
+    "tests", ["test_fault_matrix.py -k usb-", "usb_emulated.py", "usb_capture.py", "tty_emulated.py"]
+)
 def test_on_an_emulated_device(tests: str, tmp_path: Path) -> None:
     file, *chosen = tests.split()
     quietly = ("-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--timeout", "30")
