@@ -154,6 +154,34 @@ def test_pins_stay_with_the_scan(browser: Browser, node: RunningNode) -> None:
         pin.wait_for(state="detached")
 
 
+def test_a_scan_is_renamed_and_deleted_after_being_asked(browser: Browser, tmp_path: Path) -> None:
+    with ExitStack() as stack, ThreadPoolExecutor(1) as aside:
+        line = aside.submit(run_line, stack, tmp_path, "--specimen", "sphere", *FAST).result()
+        with opened(browser, line.url) as page:
+            page.locator("summary:has-text('This scan')").click()
+            page.get_by_label("Name").fill("back, left")
+            page.get_by_label("Subject code").fill("P-17")
+            page.get_by_role("button", name="Save").click()
+            page.get_by_role("button", name="back, left P-17").wait_for()
+            page.get_by_role("button", name="Delete the scan").click()
+            page.get_by_role("button", name="Keep it").click()
+            assert page.get_by_role("button", name="back, left").is_visible()
+            page.get_by_role("button", name="Delete the scan").click()
+            page.get_by_role("button", name="Delete it").click()
+            page.get_by_text("None yet.").wait_for()
+            page.get_by_text("No scan yet.").wait_for()
+
+
+def test_detail_follows_the_pointer(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        page.get_by_label("Follow my pointer").check()
+        box = page.locator("#view").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 0.48 * box["width"], box["y"] + 0.5 * box["height"])
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+        wait_updates(page, 1)
+
+
 def test_downloads_are_whole_files(browser: Browser, node: RunningNode) -> None:
     with opened(browser, node.url) as page:
         page.locator("summary:has-text('This scan')").click()
