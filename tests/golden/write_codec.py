@@ -92,8 +92,8 @@ def _lift_vectors() -> Iterator[dict[str, Any]]:
         values = _rough(shape) if name.endswith("rough") else _range(shape)
         payload = codec.encode_range(values, RangeCodec.LIFT, quantum)
         decoded = codec.decode_range(payload, RangeCodec.LIFT, shape, quantum)
-        facts = {"codec": int(RangeCodec.LIFT), "quantum": quantum, "stream_sha256": _sha256(payload)}
-        yield _write(name, "range", payload, decoded, **facts)
+        lift, whole = int(RangeCodec.LIFT), _sha256(payload)
+        yield _write(name, "range", payload, decoded, codec=lift, quantum=quantum, stream_sha256=whole)
 
 
 def _mask_vectors() -> Iterator[dict[str, Any]]:
@@ -122,7 +122,8 @@ def _range(shape: tuple[int, int]) -> StepArray:
 
 def _rough(shape: tuple[int, int]) -> StepArray:
     y, x = np.mgrid[: shape[0], : shape[1]]
-    return np.where((x + 2 * y) % 3 == 0, 1 + x * y % 300, 65535 - 40 * x).astype(np.uint16)
+    values: StepArray = np.where((x + 2 * y) % 3 == 0, 1 + x * y % 300, 65535 - 40 * x).astype(np.uint16)
+    return values
 
 
 def _mask(name: str) -> BoolArray:
