@@ -56,7 +56,7 @@ TEXTURE_BYTES_MIN = 128  # for less, no texture is tried
 HELD_MARGIN = 0.95  # what is held is known block by block, not texel by texel
 RANGE_MARGIN = 1.1  # expectations of range are a tenth off
 DOUBLINGS_MAX = 6
-NO_TEXTURE = 8.0  # doublings of error that an update without texture falls short by
+NO_TEXTURE = 16.0  # how much larger than wanted an error is left where no texture is sent, until it is known
 GENERIC_BYTES_PER_TEXEL = 0.04
 QUANTA_PER_SPACING = 6
 SKIRT_S = 1.0
@@ -207,10 +207,11 @@ class _Planner:
 
     def _shortfall(self, doubled: int, texture_left: float) -> float:
         """How far an update falls short, in doublings of error, when texture is left so many bytes."""
-        if texture_left <= 0:
-            return doubled + NO_TEXTURE
-        expected = self._expected()
-        mse = expected.mse(max(expected.quality_for_bytes(texture_left), 0))
+        if texture_left < TEXTURE_BYTES_MIN:
+            mse = self._texture_error(None) if self._model is not None else self._target_mse * NO_TEXTURE**2
+        else:
+            expected = self._expected()
+            mse = expected.mse(max(expected.quality_for_bytes(texture_left), 0))
         return float(doubled + max(math.log2(mse / self._target_mse) / 2, 0))
 
     def _expected(self) -> Expected:

@@ -93,8 +93,15 @@ def _rate(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     return record, rate.told(record)
 
 
+def _alpha(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import alpha
+
+    record = alpha.run(scans, args.size, args.clicks)
+    return record, alpha.told(record)
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, list[BenchScan]], Told]] = {
-    "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate,
+    "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate, "alpha": _alpha,
 }  # fmt: skip
 
 

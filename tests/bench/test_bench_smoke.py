@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import foveascan
-from tests.bench import codec, line, rate, roi
+from tests.bench import alpha, codec, line, rate, roi
 from tests.bench.cache import Cache
 from tests.bench.rivals.offer import straight
 from tests.bench.scans import BenchScan, load
@@ -36,6 +36,22 @@ def test_rate_control_never_goes_over_a_limit(scan: BenchScan) -> None:
     record = rate.run([scan], "S", 1)
     assert record["over"] == 0
     assert rate.told(record)
+
+
+def test_alpha_compares_profiles_at_equal_bytes(scan: BenchScan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(alpha, "ALPHAS", (None, 0.1))
+    monkeypatch.setattr(alpha, "CLASSIC_ALPHAS", (0.05,))
+    record = alpha.run([scan], "S", 1)
+    assert all(row["bytes"] <= record["limit_bytes"] for row in record["rows"])
+    thin, wide, _ = record["rows"]
+    assert thin["window_db"] > wide["window_db"]
+    assert alpha.told(record)
+
+
+def test_an_image_is_most_similar_to_itself() -> None:
+    image = np.random.default_rng(5).normal(128, 30, (200, 150)).astype(np.float32)
+    assert alpha.ms_ssim(image, image) == pytest.approx(1)
+    assert alpha.ms_ssim(image, image + 40) < alpha.ms_ssim(image, image + 4) < 1
 
 
 def test_codecs_meet_the_same_target(scan: BenchScan) -> None:
