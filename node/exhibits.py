@@ -65,6 +65,11 @@ class Exhibits:
         model = self._models.get(scan.id)
         return model.result() if model is not None and model.done() and model.exception() is None else None
 
+    @property
+    def surveying(self) -> int:
+        """How many opened scans' textures are not measured yet."""
+        return sum(not model.done() for model in self._models.values())
+
     def forget(self, scan_id: str) -> None:
         """Drop what was made of a scan that is gone."""
         for key in [key for key in self._views if key[0] == scan_id]:

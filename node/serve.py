@@ -123,7 +123,11 @@ class NodeServer:
     async def _node(self, request: web.Request) -> web.Response:
         problems = [asdict(problem) for problem in self._exhibits.library.problems]
         node = msgspec.to_builtins(self._info)
-        status = {"capture": asdict(self._capture_status()), "sharedEncodes": self._shared.encodes}
+        status = {
+            "capture": asdict(self._capture_status()),
+            "sharedEncodes": self._shared.encodes,
+            "surveying": self._exhibits.surveying,
+        }
         return _json({**node, **status, "problems": problems})
 
     async def _scans(self, request: web.Request) -> web.Response:

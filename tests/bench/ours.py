@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import aiohttp
 
 import foveascan
 from client.model import Model
@@ -41,7 +44,20 @@ async def node_with(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[Session, 
         arguments = ("serve", "--library", folder, "--listen", "127.0.0.1:0", "--insecure", "--json")
         with foveascan.started(*arguments) as (_, ready):
             async with connect(ready["url"]) as session:
+                for scan_id in ids.values():
+                    await session.open(scan_id)
+                await _surveyed(ready["url"])
                 yield session, ids
+
+
+async def _surveyed(url: str) -> None:
+    """Wait until the node has measured the textures of what is open: figures are of a node at rest."""
+    async with aiohttp.ClientSession() as http:
+        while True:
+            async with http.get(f"{url}/v1/node") as response:
+                if not (await response.json())["surveying"]:
+                    return
+            await asyncio.sleep(0.1)
 
 
 async def look(session: Session, model: Model, scan: BenchScan, click: Click, target: Target, **more: Any) -> Looked:
