@@ -40,7 +40,7 @@ export class App {
   private readonly stage: Stage;
   private readonly marks: Marks;
   private readonly scans: ScanList;
-  private readonly scanner = new ScannerPanel(() => void this.sweep());
+  private readonly scanner = new ScannerPanel(() => void this.sweep(), () => this.watch());
   private readonly look = new LookPanel(() => this.sharpenMiddle(), (tool) => this.toolChanged(tool));
   private readonly display: DisplayPanel;
   private readonly cost = new CostPanel();
@@ -55,7 +55,10 @@ export class App {
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
   private measured: Place[] = [];
+  /** The sweep that runs; the same in `live` while the picture shows it. */
+  private running: ScanInfo | null = null;
   private live: ScanInfo | null = null;
+  private startedHere = false;
   private retryTimer: ReturnType<typeof setInterval> | undefined;
   private noticeTimer: ReturnType<typeof setTimeout> | undefined;
   private followed = 0;
@@ -237,8 +240,19 @@ export class App {
 
   // A running sweep
 
+  /** A sweep runs. It takes the picture of whoever started it, or sees nothing else; others are asked. */
   private liveStarted(grid: ScanInfo): void {
+    this.running = grid;
+    document.documentElement.dataset['live'] = 'offered';
+    if (this.startedHere || !this.info) this.watch();
+    else this.scanner.offer(true);
+  }
+
+  private watch(): void {
+    const grid = this.running;
+    if (!grid) return;
     this.live = grid;
+    this.scanner.offer(false);
     this.empty.hidden = true;
     const info = thinned(grid);
     const levels = Object.values(channelShapes(info)).map((shape) => new Uint8Array(blocksAcross(shape) * blocksDown(shape)));
@@ -255,6 +269,8 @@ export class App {
 
   private liveEnded(scan: string | null, why: string): void {
     document.documentElement.dataset['live'] = 'no';
+    this.running = null;
+    this.startedHere = false;
     this.scanner.ended();
     void this.refreshCapture();
     const showing = this.live !== null;
@@ -265,10 +281,12 @@ export class App {
   }
 
   private async sweep(): Promise<void> {
+    this.startedHere = true;
     try {
       await startSweep();
       this.say(strings.scanner.started);
     } catch (error) {
+      this.startedHere = false;
       this.say(strings.failed((error as Error).message));
     }
     void this.refreshCapture();

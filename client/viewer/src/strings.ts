@@ -41,6 +41,7 @@ export const strings = {
   scanner: {
     heading: 'Scanner',
     start: 'Start a sweep',
+    watch: 'Watch the sweep',
     started: 'The sweep has been started.',
     phases: {
       ready: 'Ready', starting: 'Starting', sweeping: 'Sweeping', connecting: 'Looking for the scanner', 'no scanner': 'No scanner at this node',

@@ -219,6 +219,19 @@ def test_a_sweep_appears_as_it_runs_and_a_cut_line_is_taken_up_again(browser: Br
         wait_updates(page, 2)
 
 
+def test_a_sweep_of_somebody_else_is_offered_and_takes_no_picture_away(browser: Browser, tmp_path: Path) -> None:
+    with ExitStack() as stack, ThreadPoolExecutor(1) as aside:
+        line = aside.submit(run_line, stack, tmp_path).result()
+        with opened(browser, line.url) as page:
+            before = crop(page, 0.5, 0.45, 200)
+            assert page.request.post(f"{line.url}/v1/sweeps").ok
+            page.get_by_role("button", name="Watch the sweep").wait_for()
+            assert psnr(crop(page, 0.5, 0.45, 200), before) > 40
+            page.get_by_role("button", name="Watch the sweep").click()
+            page.wait_for_selector('html[data-live="yes"]', state="attached")
+            page.wait_for_selector('html[data-live="no"]', state="attached")
+
+
 def watch_a_sweep(page: Page) -> None:
     """Start one by its button; see it appear, and become a scan."""
     page.get_by_role("button", name="Start a sweep").click(timeout=20_000)

@@ -8,17 +8,17 @@ export class ScannerPanel {
   private readonly phase = h('p', { class: 'quiet' });
   private readonly progress = h('progress', { max: 100, 'aria-label': strings.scanner.progress, hidden: true });
   private readonly button: HTMLButtonElement;
-  private mayOperate = true;
+  private readonly watch: HTMLButtonElement;
 
-  constructor(start: () => void) {
+  constructor(start: () => void, watch: () => void) {
+    this.watch = h('button', { type: 'button', class: 'secondary', hidden: true, click: watch }, strings.scanner.watch);
     this.button = h('button', { type: 'button', click: start }, strings.scanner.start);
-    this.element = section(strings.scanner.heading, true, this.phase, this.progress, this.button);
+    this.element = section(strings.scanner.heading, true, this.phase, this.progress, this.watch, this.button);
   }
 
   /** Only operators may start sweeps. */
   allow(role: string): void {
-    this.mayOperate = role !== 'view';
-    this.button.hidden = !this.mayOperate;
+    this.button.hidden = role === 'view';
   }
 
   show(capture: Capture): void {
@@ -35,7 +35,12 @@ export class ScannerPanel {
     this.phase.textContent = strings.view.live(percent, secondsLeft);
   }
 
+  /** A sweep runs that the picture does not show. */
+  offer(offered: boolean): void {
+    this.watch.hidden = !offered;
+  }
+
   ended(): void {
-    this.progress.hidden = true;
+    this.watch.hidden = this.progress.hidden = true;
   }
 }
