@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from tests.bench.rivals import jpip, range_tiles
 from tests.bench.rivals.codestream import CodeStream, Layout
 from tests.bench.rivals.jpeg_texture import CHROMA, Q_MAX, Q_MIN, data_bytes, decode_stack, encode_stack, least
 from tests.bench.rivals.offer import PIECE_BYTES, REPLY_BYTES, Unreachable, void_mask
-from tests.bench.rivals.pyramid import Level, enlarged, promising, texture_level, tiles_over
+from tests.bench.rivals.pyramid import Level, Rect, enlarged, promising, texture_level, tiles_over
 from tests.bench.scans import BenchScan, Click
 from tests.bench.target import Target, Window, crop
 
@@ -46,9 +45,9 @@ class TileClient:
     image: np.ndarray
     tile: int
     coder: Coder
-    show: Callable[[np.ndarray, Any, Window], np.ndarray]
+    show: Callable[[np.ndarray, Rect, Window], np.ndarray]
     reached: Callable[[Window, np.ndarray], bool]
-    rect: Callable[[Window], Any]
+    rect: Callable[[Window], Rect]
     lowest: int
     highest: int
 
@@ -64,39 +63,41 @@ class TileClient:
         return sizes
 
     def _click(self, window: Window, canvas: np.ndarray, held: set[tuple[int, int]]) -> int | None:
-        places = list(self._places(self.rect(window)))
+        rect = self.rect(window)
+        places = list(self._places(rect))
         missing = [place for place in places if place not in held]
         for asked in (missing, places):
-            found = self._least(window, canvas, asked)
+            found = self._least(window, rect.of(canvas), asked)
             if found is not None:
                 size, made = found
-                canvas[:] = made
+                rect.of(canvas)[:] = made
                 held.update(asked)
                 return size
         return None
 
-    def _least(self, window: Window, canvas: np.ndarray, asked: list[tuple[int, int]]) -> tuple[int, np.ndarray] | None:
-        tiles = [self._at(self.image, place) for place in asked]
+    def _least(self, window: Window, had: np.ndarray, asked: list[tuple[int, int]]) -> tuple[int, np.ndarray] | None:
+        """The poorest setting of the tiles asked for that makes the window good: bytes, and the tiles then held."""
         rect = self.rect(window)
+        tiles = [self._at(rect.of(self.image), rect, place) for place in asked]
         tried: dict[int, tuple[int, np.ndarray]] = {}
 
         def good(setting: int) -> bool:
-            made, size = canvas.copy(), 0
+            made, size = had.copy(), 0
             if tiles:
                 decoded, size = self.coder(tiles, setting)
                 for place, tile in zip(asked, decoded, strict=True):
-                    self._at(made, place)[:] = tile
+                    self._at(made, rect, place)[:] = tile
             tried[setting] = size, made
-            return self.reached(window, self.show(rect.of(made), rect, window))
+            return self.reached(window, self.show(made, rect, window))
 
         setting = least(good, self.lowest, self.highest)
         return None if setting is None else tried[setting]
 
-    def _at(self, image: np.ndarray, place: tuple[int, int]) -> np.ndarray:
-        row, column = (index * self.tile for index in place)
-        return image[row : row + self.tile, column : column + self.tile]
+    def _at(self, image: np.ndarray, rect: Rect, place: tuple[int, int]) -> np.ndarray:
+        top, left = place[0] * self.tile - rect.top, place[1] * self.tile - rect.left
+        return image[top : top + self.tile, left : left + self.tile]
 
-    def _places(self, rect: Any) -> Iterator[tuple[int, int]]:
+    def _places(self, rect: Rect) -> Iterator[tuple[int, int]]:
         for top in range(rect.top, rect.bottom, self.tile):
             for left in range(rect.left, rect.right, self.tile):
                 yield top // self.tile, left // self.tile
@@ -222,17 +223,17 @@ def _range_coder(codec: str, quanta: list[int], tiles: Images, setting: int) -> 
     return [(value * np.float32(quantum)).astype(np.float32) for value in values], size
 
 
-def _texture_rect(shapes: Shapes, tile: int, window: Window) -> Any:
+def _texture_rect(shapes: Shapes, tile: int, window: Window) -> Rect:
     return tiles_over(window.texture, *shapes, tile)
 
 
-def _range_rect(full: tuple[int, ...], level: tuple[int, ...], tile: int, window: Window) -> Any:
+def _range_rect(full: tuple[int, ...], level: tuple[int, ...], tile: int, window: Window) -> Rect:
     return tiles_over(window.range, full, level, tile)
 
 
-def _show_texture(shapes: Shapes, kernel: str, received: np.ndarray, rect: Any, window: Window) -> np.ndarray:
+def _show_texture(shapes: Shapes, kernel: str, received: np.ndarray, rect: Rect, window: Window) -> np.ndarray:
     return enlarged(received, rect, window.texture, shapes, kernel)
 
 
-def _show_range(level: float, received: np.ndarray, rect: Any, window: Window) -> np.ndarray:
+def _show_range(level: float, received: np.ndarray, rect: Rect, window: Window) -> np.ndarray:
     return range_tiles.shown(received, rect, window, level, "point", "linear")
