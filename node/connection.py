@@ -11,25 +11,19 @@ import asyncio
 import logging
 import time
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
 
 from aiohttp import WSMsgType, web
 
 from node.auth import Auth
-from node.classic import ClassicCoded, ClassicState
-from node.classic_planner import ClassicUpdate, plan_classic
-from node.coded import Coded
+from node.bound import Bound, updated
+from node.classic_planner import ClassicUpdate
 from node.exhibits import Exhibits
-from node.foveate import Update, plan_update
-from node.library import Scan
+from node.foveate import Update
 from node.live import Live, Place
 from node.rate import RateControl
-from node.state import ClientState
 from protocol import messages as m
 from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
-from protocol.holdings import ChannelHoldings
-from protocol.lattice import Channel
 from protocol.live import LiveColumns
 from protocol.session import Phase, Role, Session
 
@@ -41,16 +35,6 @@ ACK_S = 60.0
 QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
 CLOSE_PROTOCOL_ERROR = 1002
 CLOSE_REASON_MAX = 120  # of 123 bytes
-
-
-@dataclass(slots=True, eq=False)
-class _Bound:
-    """The scan a stream is looking at."""
-
-    epoch: int
-    scan: Scan
-    state: ClientState | ClassicState
-    next_seq: int
 
 
 class Connection:
@@ -74,8 +58,8 @@ class Connection:
         self._info = info
         self._session = Session(Role.NODE)
         self._rate = RateControl(cold_start_bytes_s)
-        self._codec: m.CodecName = "htj2k"
-        self._bound: _Bound | None = None
+        self._codecs: tuple[m.CodecName, ...] = ("htj2k",)
+        self._bound: Bound | None = None
         self._epoch = 0
         self._opens: deque[m.Open] = deque()
         self._look: m.Look | None = None
@@ -131,7 +115,7 @@ class Connection:
         if role is None:
             await self._send(m.Refused(0, "forbidden", "this node needs a token"))
             return False
-        self._codec = message.codecs[0]
+        self._codecs = message.codecs
         await self._send(m.Welcome(role))
         return True
 
@@ -196,10 +180,7 @@ class Connection:
         bound = self._bound
         if bound is None or said.epoch != bound.epoch:
             return
-        if said.next_seq > bound.next_seq:
-            raise RemoteWireError(f"state: refinement {said.next_seq} cannot be next, {bound.next_seq} is")
-        _adopt_word(bound, said)
-        bound.next_seq = said.next_seq
+        bound.adopt_word(said)
         self._acknowledged.set()
 
     # -- answering -------------------------------------------------------------------------------------------------
@@ -227,11 +208,11 @@ class Connection:
 
     async def _open(self, wanted: m.Open) -> None:
         try:
-            scan, view = await self._exhibits.open(wanted.scan, self._codec, wanted.profile)
+            scan, view = await self._exhibits.open(wanted.scan, self._codecs[0], wanted.profile)
             self._epoch = (self._epoch + 1) & 0xFFFF
-            bound = _Bound(self._epoch, scan, view.state.copy(), 0)
+            bound = Bound(self._epoch, scan, view.state.copy())
             if wanted.holdings is not None:
-                _adopt_holdings(bound.state, wanted.holdings)
+                bound.adopt_holdings(wanted.holdings)
         except LibraryError as error:
             await self._send(m.Refused(wanted.request, "not found", str(error)[:500]))
             return
@@ -267,7 +248,7 @@ class Connection:
         self._rate.encoded(spent_s)
         await self._send_update(bound, look, update, spent_s)
 
-    async def _plan(self, bound: _Bound, look: m.Look) -> Update | ClassicUpdate:
+    async def _plan(self, bound: Bound, look: m.Look) -> Update | ClassicUpdate:
         budget = look.max_bytes
         if look.max_wait_s is not None:
             affordable = self._rate.budget_bytes(look.max_wait_s)
@@ -276,34 +257,17 @@ class Connection:
         def superseded() -> bool:
             return self._look is not None or self._running_look is not look
 
-        classic = isinstance(bound.state, ClassicState)
-        if classic != (look.profile == "classic"):
-            raise LatticeError(f"the scan is not open with the {look.profile} profile")
-        if isinstance(bound.state, ClassicState):
-            return await self._exhibits.work(partial(plan_classic, bound.scan, bound.state, look, budget, superseded))
         model = self._exhibits.texture_model(bound.scan)
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
-        job = partial(plan_update, bound.scan, bound.state, look, self._codec, budget, superseded, model, quick)
-        return await self._exhibits.work(job)
+        return await self._exhibits.work(partial(bound.plan, look, self._codecs, budget, superseded, model, quick))
 
-    async def _send_update(
-        self, bound: _Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float
-    ) -> None:
-        bound.state = update.state
+    async def _send_update(self, bound: Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float) -> None:
         if update.coded:
             self._acknowledged.clear()
             self._begin_timing()
-        first_seq = bound.next_seq
-        bound.next_seq += len(update.coded)  # at once: what is said meanwhile counts all of them
-        refinements: tuple[Coded | ClassicCoded, ...] = update.coded
-        for seq, coded in enumerate(refinements, first_seq):
-            await self._send_bytes(coded.refinement(bound.epoch, seq, look.request).to_bytes())
-        await self._send(
-            m.Updated(
-                look.request, bound.next_seq, update.reason, update.error_max_mm, update.texture_db, update.encodes,
-                round(1000 * spent_s, 3),
-            )  # fmt: skip
-        )
+        for refinement in bound.take(update, look):  # counts all of them at once, as what is said meanwhile must
+            await self._send_bytes(refinement)
+        await self._send(updated(look, bound.next_seq, update, spent_s))
 
     async def _show_live(self) -> None:
         """Send what is new in the running sweep, as long as the client watches."""
@@ -345,28 +309,3 @@ class Connection:
 def _cut(reason: str) -> bytes:
     """As much of a reason as fits a close frame, whole characters only."""
     return reason.encode()[:CLOSE_REASON_MAX].decode(errors="ignore").encode()
-
-
-def _adopt_word(bound: _Bound, said: m.State) -> None:
-    """Take the client's word for what it holds. Raises RemoteWireError when it is no statement of this scan."""
-    if not isinstance(bound.state, ClassicState):
-        _adopt_holdings(bound.state, said.holdings)
-        return
-    try:
-        bound.state = bound.state.at(said.next_seq)
-    except LatticeError as error:
-        raise RemoteWireError(f"state: {error}") from None
-
-
-def _adopt_holdings(state: ClientState | ClassicState, said: m.Statement) -> None:
-    if isinstance(state, ClassicState):
-        raise RemoteWireError("a classic opening begins with its first view, not with holdings")
-    try:
-        channels = {
-            Channel.RANGE: ChannelHoldings.from_runs(state.shapes[Channel.RANGE], said.range),
-            Channel.TEXTURE: ChannelHoldings.from_runs(state.shapes[Channel.TEXTURE], said.texture),
-        }
-    except LatticeError as error:
-        raise RemoteWireError(f"holdings: {error}") from None
-    state.holdings.channels = channels
-    state.holdings.content = 0

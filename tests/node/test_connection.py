@@ -17,8 +17,10 @@ from node.library import About, Library
 from node.live import Live
 from node.serve import NodeServer
 from protocol import messages as m
+from protocol.codec import TextureCodec
 from protocol.holdings import Holdings
 from protocol.lattice import Channel
+from protocol.refinement import Refinement
 from tests.node.scans import make_grid
 
 Client = TestClient[aiohttp.web.Request, aiohttp.web.Application]
@@ -36,10 +38,10 @@ async def node(tmp_path: Path) -> AsyncIterator[Client]:
     exhibits.close()
 
 
-async def opened(node: Client) -> tuple[ClientWebSocketResponse, m.Opened]:
+async def opened(node: Client, *codecs: m.CodecName) -> tuple[ClientWebSocketResponse, m.Opened]:
     """A stream with the newest scan open, its first view received and not acknowledged."""
     stream = await node.ws_connect("/v1/stream", protocols=[m.PROTOCOL])
-    for said in (m.Hello(m.PROTOCOL), m.Open(1, "latest")):
+    for said in (m.Hello(m.PROTOCOL, codecs=codecs or ("htj2k",)), m.Open(1, "latest")):
         await stream.send_str(m.encode_message(said))
     answers = [await stream.receive() for _ in range(5)]
     assert [answer.type for answer in answers] == [WSMsgType.TEXT] * 3 + [WSMsgType.BINARY] * 2
@@ -72,6 +74,20 @@ async def test_a_client_may_state_what_it_holds_at_any_time(node: Client) -> Non
     updated = m.decode_message((await stream.receive()).data)
     assert isinstance(updated, m.Updated)
     assert (updated.request, updated.next_seq) == (7, 2)
+    await stream.close()
+
+
+@pytest.mark.parametrize(("texture_db", "codec"), [(32, TextureCodec.JPEG), (45, TextureCodec.HTJ2K)])
+async def test_a_client_that_likes_jpeg_gets_better_texture_than_that_has(
+    node: Client, texture_db: float, codec: TextureCodec
+) -> None:
+    stream, answer = await opened(node, "jpeg", "htj2k")
+    for asked in (state(answer, 2), m.Look(2, 0.75, 0.5, texture_db=texture_db)):
+        await stream.send_str(m.encode_message(asked))
+    *_, texture = [Refinement.from_bytes((await stream.receive()).data) for _ in Channel]
+    assert (texture.channel, texture.codec) == (Channel.TEXTURE, codec)
+    ended = m.decode_message((await stream.receive()).data)
+    assert isinstance(ended, m.Updated) and ended.texture_db is not None and ended.texture_db >= texture_db
     await stream.close()
 
 

@@ -1,0 +1,130 @@
+"""The scan that a stream looks at: its opening, what the client holds of it, and the updates that change that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from node.classic import ClassicCoded, ClassicState
+from node.classic_planner import ClassicUpdate, plan_classic
+from node.coded import Coded
+from node.foveate import Update, plan_update
+from node.library import Scan
+from node.refine_texture import mse_of_db
+from node.state import ClientState
+from node.texture_model import TextureModel
+from protocol import messages as m
+from protocol.codec import JPEG_QUALITY_MAX, TextureCodec
+from protocol.errors import LatticeError, RemoteWireError
+from protocol.holdings import ChannelHoldings
+from protocol.lattice import Channel
+from protocol.region import region_round
+
+
+@dataclass(slots=True, eq=False)
+class Bound:
+    """One opening of a scan. state : what the client holds, as we believe.  next_seq : of the next refinement."""
+
+    epoch: int
+    scan: Scan
+    state: ClientState | ClassicState
+    next_seq: int = 0
+
+    def plan(
+        self,
+        look: m.Look,
+        codecs: Sequence[m.CodecName],
+        budget_bytes: int | None,
+        superseded: Callable[[], bool],
+        model: TextureModel | None,
+        quick: bool,
+    ) -> Update | ClassicUpdate:
+        """The update that answers a look; arguments as for plan_update. codecs : what the client takes, best first.
+
+        Raises LatticeError or CodecError where the look does not fit the scan or its opening.
+        """
+        is_classic = isinstance(self.state, ClassicState)
+        if is_classic != (look.profile == "classic"):
+            raise LatticeError(f"the scan is not open with the {look.profile} profile")
+        if isinstance(self.state, ClassicState):
+            return plan_classic(self.scan, self.state, look, budget_bytes, superseded)
+        codec = choose_codec(codecs, self.scan, look, model)
+        update = plan_update(self.scan, self.state, look, codec, budget_bytes, superseded, model, quick)
+        if codec == "htj2k" or "htj2k" not in codecs or not _falls_short(update, look):
+            return update
+        better = plan_update(self.scan, self.state, look, "htj2k", budget_bytes, superseded, model, quick)
+        return replace(better, encodes=update.encodes + better.encodes)
+
+    def take(self, update: Update | ClassicUpdate, look: m.Look) -> list[bytes]:
+        """Count an update as sent; returns its refinements on the wire, in order."""
+        coded: tuple[Coded | ClassicCoded, ...] = update.coded
+        refinements = [one.refinement(self.epoch, seq, look.request) for seq, one in enumerate(coded, self.next_seq)]
+        self.state = update.state
+        self.next_seq += len(coded)
+        return [refinement.to_bytes() for refinement in refinements]
+
+    def adopt_word(self, said: m.State) -> None:
+        """Take the client's word for what it holds. Raises RemoteWireError when it is no statement of this opening."""
+        if said.next_seq > self.next_seq:
+            raise RemoteWireError(f"state: refinement {said.next_seq} cannot be next, {self.next_seq} is")
+        if isinstance(self.state, ClassicState):
+            try:
+                self.state = self.state.at(said.next_seq)
+            except LatticeError as error:
+                raise RemoteWireError(f"state: {error}") from None
+        else:
+            self.adopt_holdings(said.holdings)
+        self.next_seq = said.next_seq
+
+    def adopt_holdings(self, said: m.Statement) -> None:
+        """The same for holdings alone."""
+        if isinstance(self.state, ClassicState):
+            raise RemoteWireError("a classic opening begins with its first view, not with holdings")
+        shapes = self.state.shapes
+        try:
+            channels = {
+                Channel.RANGE: ChannelHoldings.from_runs(shapes[Channel.RANGE], said.range),
+                Channel.TEXTURE: ChannelHoldings.from_runs(shapes[Channel.TEXTURE], said.texture),
+            }
+        except LatticeError as error:
+            raise RemoteWireError(f"holdings: {error}") from None
+        self.state.holdings.channels = channels
+        self.state.holdings.content = 0
+
+
+def choose_codec(codecs: Sequence[m.CodecName], scan: Scan, look: m.Look, model: TextureModel | None) -> m.CodecName:
+    """The texture codec that the client likes best; but HTJ2K, if it takes that, where JPEG's best will fall short.
+
+    A guess: until the scan's texture is measured nobody knows, and then JPEG of equal quality is a little off.
+    """
+    if codecs[0] != "jpeg" or "htj2k" not in codecs or model is None:
+        return codecs[0]
+    share = look.window if look.scale is None else look.scale**2
+    window = region_round(look.u, look.v, share, scan.spec.texture_width, scan.spec.texture_height)
+    best = model.expect(window, TextureCodec.JPEG).mse(JPEG_QUALITY_MAX)
+    return "jpeg" if best <= mse_of_db(look.texture_db) else "htj2k"
+
+
+def _falls_short(update: Update, look: m.Look) -> bool:
+    """Whether the codec, and not the bytes there were, kept the texture from what the look asks for."""
+    return update.reason == "complete" and update.texture_db is not None and update.texture_db < look.texture_db
+
+
+def updated(look: m.Look, next_seq: int, update: Update | ClassicUpdate, node_s: float) -> m.Updated:
+    """What ends an update, in few digits that promise no more than the truth: errors rounded up, PSNR down."""
+    return m.Updated(
+        look.request,
+        next_seq,
+        update.reason,
+        None if update.error_max_mm is None else _rounded(math.ceil, update.error_max_mm, 4),
+        None if update.texture_db is None else _rounded(math.floor, update.texture_db, 2),
+        update.encodes,
+        round(1000 * node_s, 3),
+    )
+
+
+def _rounded(to_whole: Callable[[float], int], value: float, digits: int) -> float:
+    """A value in so many digits. Noise of float64 far behind them does not count: 51 steps of 0.002 are 0.102."""
+    unit = 10.0**digits
+    return to_whole(round(value * unit, 6)) / unit
