@@ -13,7 +13,7 @@ import select
 import socket
 import threading
 import time
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -190,17 +190,3 @@ def _serial_path(address: str) -> str:
         others = f"; {len(ports)} of this kind with other serial numbers are" if ports else ""
         raise PortLost(f"{address}: no such serial port is connected{others}")
     return chosen[0]
-
-
-def wait_for_port(address: str, baud: int, timeout_s: float, stop: threading.Event) -> Port:
-    """Open a port, as soon as it is there. Raises PortLost when the time is over."""
-    until_s = time.monotonic() + timeout_s
-    with closing(Arrivals()) as arrivals:
-        while True:
-            try:
-                return open_port(address, baud)
-            except PortLost:
-                if not arrivals.wait(min(1.0, until_s - time.monotonic()), stop) and time.monotonic() >= until_s:
-                    raise
-                if stop.is_set():
-                    raise

@@ -74,8 +74,12 @@ class UsbPort:
         self._lost: str | None = None
         self._detached: int | None = None
         self._device = _find(address, backend)
-        with self._translated("open"):
-            self._interface, self._source, self._sink = self._claim()
+        try:
+            with self._translated("open"):
+                self._interface, self._source, self._sink = self._claim()
+        except PortLost:
+            self._let_go()
+            raise
         self._reader = threading.Thread(target=self._pump, name=f"read {address}", daemon=True)
         self._reader.start()
 
@@ -123,6 +127,10 @@ class UsbPort:
         self._reader.join()
         with suppress(*_GONE):
             usb.util.release_interface(self._device, self._interface)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Give the device back to whoever had it."""
         with suppress(*_GONE):
             if self._detached is not None:
                 self._device.attach_kernel_driver(self._detached)

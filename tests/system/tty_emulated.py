@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.discover import Arrivals, find_ports, open_port, wait_for_port
+from drivers.discover import Arrivals, find_ports, open_port
 from protocol.errors import PortLost
 from simulators.tty_testbed import TtyTestbed
 from simulators.usb_testbed import UsbTestbed
@@ -83,19 +83,6 @@ def test_plugging_in_and_out_is_noticed_soon(bed: TtyTestbed) -> None:
         timer.join()
         ports[0].pull()
         assert arrivals.wait(10, stop)
-
-
-def test_a_port_is_opened_as_soon_as_it_is_there(bed: TtyTestbed) -> None:
-    stop, ports = threading.Event(), []
-    timer = threading.Timer(0.3, lambda: ports.append(Plugged(bed)))
-    timer.start()
-    began_s = time.monotonic()
-    wait_for_port(ADDRESS, 3_000_000, 20, stop).close()
-    assert time.monotonic() - began_s < 2
-    timer.join()
-    ports[0].pull()
-    with pytest.raises(PortLost):
-        wait_for_port(ADDRESS, 3_000_000, 0.1, stop)
 
 
 def test_bare_usb_devices_are_found_too() -> None:
