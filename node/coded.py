@@ -20,7 +20,8 @@ class Coded:
 
     adopted : (by, bx) bool over the lattice's covered blocks.
     rank, quality, codec : as in protocol.holdings and protocol.refinement.
-    patch : the dense rectangle that a client makes of it, voids included; texture: None where nobody measured it.
+    decoded : range only, the samples as a client decodes them.
+    patch : texture only, the dense rectangle that a client makes of it; None where nobody measured it.
     """
 
     selection: Selection
@@ -30,7 +31,8 @@ class Coded:
     codec: int
     payload: bytes
     mask: bytes = b""
-    patch: StepArray | ImageArray | None = None
+    decoded: StepArray | None = None
+    patch: ImageArray | None = None
 
     @property
     def channel(self) -> Channel:

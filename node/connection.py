@@ -267,6 +267,8 @@ class Connection:
             self._begin_timing()
         for refinement in bound.take(update, look):  # counts all of them at once, as what is said meanwhile must
             await self._send_bytes(refinement)
+        if isinstance(update, Update) and update.settle is not None:
+            update = await self._exhibits.work(update.settled)
         await self._send(updated(look, bound.next_seq, update, spent_s))
 
     async def _show_live(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import msgspec
@@ -27,6 +27,7 @@ from node.refine_range import (
     expected_range_bytes,
     note_range,
     select_range,
+    settle_range,
 )
 from node.refine_texture import (
     CODECS,
@@ -71,7 +72,8 @@ class Update:
     """A planned update.
 
     coded : its refinements, in order.    state : the client's state once they have arrived.
-    error_max_mm, texture_db : what is left in the window; None where this update did not measure it.
+    error_max_mm, texture_db : what is left in the window; None where this update did not measure it, or not yet.
+    settle : computes what may wait (digest, errors); None when nothing does.
     """
 
     coded: tuple[Coded, ...]
@@ -80,6 +82,13 @@ class Update:
     error_max_mm: float | None = None
     texture_db: float | None = None
     encodes: int = 0
+    settle: Callable[[], float] | None = None
+
+    def settled(self) -> Update:
+        """The same with its state complete and error_max_mm known: work that can wait until the bytes are sent."""
+        if self.settle is None:
+            return self
+        return replace(self, error_max_mm=self.settle(), settle=None)
 
     @property
     def wire_bytes(self) -> int:
@@ -135,6 +144,7 @@ class _Planner:
         self._left = math.inf if budget_bytes is None else budget_bytes - REPLY_BYTES
         self._superseded = superseded
         self._coded: list[Coded] = []
+        self._unsettled: list[Coded] = []
         self._encodes = 0
         self._limited = False
         self._texture_db: float | None = None
@@ -149,7 +159,7 @@ class _Planner:
         """Choose, encode and note the refinements."""
         explicit = self._look.parameters
         if explicit is not None:
-            self._take(self._code_range(explicit.range) if explicit.range else None)
+            self._take(self._code_range(explicit.range) if explicit.range else None, settle=False)
             self._take(self._code_texture(explicit.texture) if explicit.texture else None)
             return
         wanted, range_bytes = self._divide()
@@ -162,8 +172,15 @@ class _Planner:
     def update(self) -> Update:
         """What came of it."""
         reason: Reason = "byte limit" if self._limited else "complete"
-        error_mm = _error_in(self._state, self._range_region) * self._scan.spec.step_mm
-        return Update(tuple(self._coded), self._state, reason, error_mm, self._texture_db, self._encodes)
+        coded = tuple(self._coded)
+        update = Update(coded, self._state, reason, None, self._texture_db, self._encodes, self._settle)
+        return update if self._unsettled else update.settled()
+
+    def _settle(self) -> float:
+        """Note what was left for later. Returns the largest range error left in the window. [mm]"""
+        while self._unsettled:
+            settle_range(self._scan, self._state, self._unsettled.pop(), self._target_steps)
+        return _error_in(self._state, self._range_region) * self._scan.spec.step_mm
 
     # -- how much for range, how much for texture ------------------------------------------------------------------
 
@@ -272,7 +289,7 @@ class _Planner:
         region = self._texture_region
         total, count = 0.0, 0
         if coded is not None and coded.patch is not None:
-            total, count = adopted_error(self._scan, coded.selection, region, coded.patch.astype(np.uint8, copy=False))
+            total, count = adopted_error(self._scan, coded.selection, region, coded.patch)
         held_total, held_count = held_error(self._state, coded, region, self._model, self._target_mse)
         return (total + held_total) / max(count + held_count, 1)
 
@@ -355,15 +372,18 @@ class _Planner:
             raise _Superseded
         self._encodes += 1
 
-    def _take(self, coded: Coded | None) -> None:
-        """Add a refinement to the update, if it fits what is left."""
+    def _take(self, coded: Coded | None, *, settle: bool = True) -> None:
+        """Add a refinement to the update, if it fits what is left; note its errors at once or later."""
         if coded is None:
             return
         if coded.wire_bytes > self._left:
             self._limited = True
             return
         self._left -= coded.wire_bytes
-        if coded.channel is Channel.RANGE:
+        if coded.channel is Channel.RANGE and not settle:
+            coded.note(self._state)
+            self._unsettled.append(coded)
+        elif coded.channel is Channel.RANGE:
             note_range(self._scan, self._state, coded, self._target_steps)
         else:
             note_texture(self._scan, self._state, coded)

@@ -18,6 +18,7 @@ from node.coded import Coded
 from node.library import Scan
 from node.refine_range import (
     PERCENTILE,
+    client_range,
     code_range,
     code_range_lattice,
     range_lattice,
@@ -74,7 +75,7 @@ def _allowed_beyond(scan: Scan, region: Region) -> int:
 
 def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps: float) -> int:
     """How many of a region's cells a refinement leaves further off than target_steps."""
-    if coded is None or coded.patch is None:
+    if coded is None:
         return 0
     selection = coded.selection
     rows = selection.y.start + np.arange(selection.y.low.size)
@@ -82,7 +83,7 @@ def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps:
     inside = (rows >= region.top) & (rows < region.top + region.height)
     across = (columns - region.left) % region.turn < region.width
     truth = np.asarray(cut(scan.range_steps, selection), np.int32)
-    far = np.abs(coded.patch.astype(np.int32) - truth) > target_steps
+    far = np.abs(client_range(scan, coded).astype(np.int32) - truth) > target_steps
     far &= (truth != VOID) & selection.adopted_cells()
     return int(np.count_nonzero(far[inside][:, across]))
 

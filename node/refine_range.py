@@ -17,7 +17,7 @@ from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
 from protocol.codec_lift import encode_and_decode, survey
-from protocol.grid import VOID, BoolArray
+from protocol.grid import VOID, BoolArray, StepArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
@@ -73,13 +73,18 @@ def code_range_lattice(scan: Scan, state: ClientState, parameters: Parameters, q
     if found is None:
         return None
     selection, adopted, quantum = found
-    void = void_cells(scan, selection)
     samples, seen = range_samples(scan, selection)
     payload, decoded = encode_and_decode(samples, quantum, seen)
-    patch = range_patch(selection, decoded)
-    patch[void] = VOID
-    mask = encode_mask(void)
-    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, mask, patch)
+    mask = encode_mask(void_cells(scan, selection))
+    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, mask, decoded)
+
+
+def client_range(scan: Scan, coded: Coded) -> StepArray:
+    """The dense rectangle that a client makes of a range refinement, voids included."""
+    assert coded.decoded is not None  # code_range_lattice keeps it
+    patch = range_patch(coded.selection, coded.decoded)
+    patch[void_cells(scan, coded.selection)] = VOID
+    return patch
 
 
 def select_range(
@@ -114,9 +119,13 @@ def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
 
 def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:
     """Record a range refinement in a client's state: holdings, digest and the error left in its blocks."""
-    assert coded.patch is not None  # code_range made it
     coded.note(state)
-    patch, selection = coded.patch.astype(np.uint16, copy=False), coded.selection
+    settle_range(scan, state, coded, target_steps)
+
+
+def settle_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:
+    """The part of note_range that can wait until the refinement is on its way: digest and errors."""
+    patch, selection = client_range(scan, coded), coded.selection
     state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
     error, beyond = block_errors(patch, np.asarray(cut(scan.range_steps, selection)), target_steps)
     rows, columns = np.nonzero(selection.adopted)

@@ -56,6 +56,7 @@ class Viewer:
 
     def take(self, update: Update) -> int:
         """Apply an update as it travels; its bytes on the wire."""
+        update = update.settled()
         size = 0
         for coded in update.coded:
             data = coded.refinement(1, self.seq, 1).to_bytes()
