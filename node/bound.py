@@ -89,8 +89,7 @@ class Bound:
             }
         except LatticeError as error:
             raise RemoteWireError(f"holdings: {error}") from None
-        self.state.holdings.channels = channels
-        self.state.holdings.content = 0
+        self.state.take_word(channels)
 
 
 def choose_codec(codecs: Sequence[m.CodecName], scan: Scan, look: m.Look, model: TextureModel | None) -> m.CodecName:

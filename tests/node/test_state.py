@@ -1,0 +1,56 @@
+"""What the node believes of a client after the client has stated its holdings itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from node.first_view import build_first_view
+from node.foveate import plan_update
+from node.library import Scan
+from node.state import ClientState
+from protocol.holdings import ChannelHoldings
+from protocol.lattice import Channel
+from protocol.messages import Look, LookParameters, RangeParameters
+from tests.node.scans import keep, make_grid
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return keep(make_grid(), tmp_path_factory.mktemp("library"))
+
+
+def restated(state: ClientState, level: int | None = None, rank: int = 65534) -> ClientState:
+    """A copy that has taken a client's word: its own holdings, or one level and rank everywhere."""
+    copy = state.copy()
+    channels = {channel: held.copy() for channel, held in copy.holdings.channels.items()}
+    if level is not None:
+        shape = copy.shapes[Channel.RANGE]
+        size = shape.blocks[0] * shape.blocks[1]
+        channels[Channel.RANGE] = ChannelHoldings.from_runs(shape, [[size, level, rank]])
+    copy.take_word(channels)
+    return copy
+
+
+def test_a_client_that_holds_what_we_thought_changes_nothing(scan: Scan) -> None:
+    first = build_first_view(scan, "htj2k", 32768).state
+    look = Look(1, 0.5, 0.5, parameters=LookParameters(RangeParameters(2, 9)))
+    after = plan_update(scan, first, look, "htj2k").settled().state
+    same = restated(after)
+    np.testing.assert_array_equal(same.error, after.error)
+    np.testing.assert_array_equal(same.beyond, after.beyond)
+    assert same.holdings.content == 0
+
+
+def test_whoever_says_to_have_everything_is_told_that_nothing_is_left(scan: Scan) -> None:
+    state = restated(build_first_view(scan, "htj2k", 32768).state, level=0)
+    update = plan_update(scan, state, Look(1, 0.5, 0.5, parameters=LookParameters(RangeParameters(1, 1))), "htj2k")
+    assert update.coded == ()
+    assert update.error_max_mm == 0
+
+
+def test_what_is_held_in_a_way_unknown_to_us_is_sent_again_where_it_matters(scan: Scan) -> None:
+    first = build_first_view(scan, "htj2k", 32768).state
+    state = restated(first, level=2, rank=65535 - 9)
+    np.testing.assert_array_equal(state.error, first.error)
+    assert (state.cells_beyond(10) == 64).any()
