@@ -1,0 +1,255 @@
+"""The reading half of a session: takes what the node says, changes the model, and tells whoever waits.
+
+One task reads the stream and is the only one that changes the model: refinements are applied one after the other, in
+a worker thread, so that the event loop stays free. Whoever asked for something waits on a future of that request.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+from weakref import WeakSet
+
+from client.errors import NodeLost, RequestRefused
+from client.live import LiveFeed
+from client.model import Applied, Model
+from client.news import News
+from client.replica import Replica
+from client.stream import Stream
+from client.update import Tally, Update
+from protocol import messages as m
+from protocol.errors import RemoteWireError
+from protocol.live import LiveColumns
+from protocol.refinement import Generator, Refinement
+from protocol.session import Said
+
+log = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer", Model, Update)
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """What a session has carried so far. Bytes are of WebSocket messages; apply_s is decoding and reconstruction."""
+
+    bytes_sent: int
+    bytes_received: int
+    refinements: int
+    samples: int
+    updates: int
+    resyncs: int
+    apply_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Looking:
+    """A look in the air."""
+
+    tally: Tally
+    answer: asyncio.Future[Update]
+
+    def close(self, said: m.Updated, lost: int = 0) -> None:
+        _settle(self.answer, self.tally.close(said, lost))
+
+
+class Reader:
+    """Reads a stream from now on. live : the running sweep's frames.  ended : why nothing more comes; None: it does."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.live = LiveFeed()
+        self.ended: Exception | None = None
+        self._stream = stream
+        self._replica: Replica | None = None
+        self._request = 0
+        self._opening: dict[int, asyncio.Future[Model]] = {}
+        self._looking: dict[int, _Looking] = {}
+        self._news: WeakSet[News] = WeakSet()
+        self._refinements = self._samples = self._updates = self._resyncs = 0
+        self._apply_s = 0.0
+        self._applying: asyncio.Future[Applied | None] | None = None
+        self._task = asyncio.create_task(self._read())
+
+    @property
+    def model(self) -> Model | None:
+        """The scan that is open; None before the first."""
+        return self._replica.model if self._replica and self._replica.model.complete else None
+
+    @property
+    def stats(self) -> Stats:
+        """What the stream has carried so far."""
+        return Stats(
+            self._stream.bytes_sent,
+            self._stream.bytes_received,
+            self._refinements,
+            self._samples,
+            self._updates,
+            self._resyncs,
+            self._apply_s,
+        )
+
+    def new_request(self) -> int:
+        """The number of the next request."""
+        self._request += 1
+        return self._request
+
+    @contextmanager
+    def opening(self, request: int) -> Iterator[asyncio.Future[Model]]:
+        """While somebody waits for a scan to be open: its model, once the first view is in."""
+        answer: asyncio.Future[Model] = asyncio.get_running_loop().create_future()
+        self._opening[request] = answer
+        try:
+            yield answer
+        finally:
+            self._opening.pop(request, None)
+
+    @contextmanager
+    def looking(self, request: int) -> Iterator[asyncio.Future[Update]]:
+        """While somebody waits for the answer to a look."""
+        answer: asyncio.Future[Update] = asyncio.get_running_loop().create_future()
+        self._looking[request] = _Looking(Tally(request), answer)
+        try:
+            yield answer
+        finally:
+            self._looking.pop(request, None)
+
+    def is_looking(self, request: int) -> bool:
+        """Whether a look is still to be answered."""
+        return request in self._looking and self.ended is None
+
+    def published(self) -> News:
+        """Ids of scans published from now on."""
+        news = News()
+        self._news.add(news)
+        if self.ended is not None:
+            news.end(self.ended)
+        return news
+
+    async def close(self) -> None:
+        """Read no more; whoever still waits gets NodeLost."""
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        if self._applying is not None:
+            await asyncio.gather(self._applying, return_exceptions=True)
+        self._end(NodeLost("the session was closed"), on_purpose=True)
+
+    async def _read(self) -> None:
+        try:
+            while True:
+                await self._take(*await self._stream.receive())
+        except RemoteWireError as violation:
+            self._end(violation)
+            await self._stream.close(violation)
+        except Exception as error:  # whatever it was, whoever waits must hear of it
+            self._end(error)
+
+    async def _take(self, said: Said, size: int) -> None:
+        match said:
+            case Refinement():
+                await self._refine(said, size)
+            case m.Opened():
+                self._bind(said)
+            case m.Updated():
+                await self._answer(said, size)
+            case m.Resync():
+                await self._state(self._bound().state())
+            case m.Refused():
+                self._refuse(said)
+            case m.Published(scan=scan):
+                for news in list(self._news):
+                    news.tell(scan)
+            case LiveColumns() | m.LiveStarted() | m.LiveProgress() | m.LiveEnded():
+                self.live.take(said)
+            case m.Goodbye(reason=reason):
+                raise NodeLost(f"{self._stream.url} ended the stream: {reason}")
+
+    async def _refine(self, refinement: Refinement, size: int) -> None:
+        replica, look = self._bound(), self._looking.get(refinement.look)
+        if look is not None:
+            look.tally.bytes_received += size
+        self._applying = asyncio.get_running_loop().run_in_executor(None, replica.apply, refinement)
+        applied = await asyncio.shield(self._applying)
+        if applied is None:
+            await self._state(replica.object())
+            return
+        self._refinements += 1
+        self._samples += refinement.samples
+        self._apply_s += applied.apply_s
+        if look is not None:
+            look.tally.add(refinement, applied)
+        if refinement.generator is Generator.COARSE and replica.model.complete:
+            await self._first_view(replica)
+
+    async def _first_view(self, replica: Replica) -> None:
+        if (waiting := self._opening.pop(replica.request, None)) is not None:
+            _settle(waiting, replica.model)
+        await self._stream.send(replica.acknowledge())
+
+    def _bind(self, opened: m.Opened) -> None:
+        self._check_asked(opened.request)
+        self._replica = Replica(opened)
+        for older in [request for request in self._looking if request < opened.request]:
+            self._looking.pop(older).close(m.Updated(older, 0, "superseded"))
+
+    async def _answer(self, updated: m.Updated, size: int) -> None:
+        self._check_asked(updated.request)
+        replica = self._bound()
+        superseded = updated.reason == "superseded"  # may overtake the update in the air, so it says nothing of order
+        lost = 0 if superseded else replica.missing(updated)
+        self._updates += 1
+        if (look := self._looking.pop(updated.request, None)) is not None:
+            look.tally.bytes_received += size
+            look.close(updated, lost)
+        if lost:
+            await self._state(replica.object())
+        elif not superseded:
+            await self._stream.send(replica.acknowledge())
+
+    async def _state(self, state: m.State | None) -> None:
+        if state is not None:
+            self._resyncs += 1
+            await self._stream.send(state)
+
+    def _refuse(self, refused: m.Refused) -> None:
+        error = RequestRefused(refused.code, refused.message)
+        if (look := self._looking.pop(refused.request, None)) is not None:
+            _settle(look.answer, error)
+        elif (opening := self._opening.pop(refused.request, None)) is not None:
+            _settle(opening, error)
+        else:
+            log.warning("%s, about request %d, which nobody waits for", error, refused.request)
+
+    def _end(self, cause: Exception, on_purpose: bool = False) -> None:
+        if self.ended is None:
+            self.ended = cause
+            for opening in self._opening.values():
+                _settle(opening, cause)
+            for look in self._looking.values():
+                _settle(look.answer, cause)
+            self._opening.clear()
+            self._looking.clear()
+            for news in list(self._news):
+                news.end(None if on_purpose else cause)
+            self.live.end(None if on_purpose else cause)
+
+    def _check_asked(self, request: int) -> None:
+        if not 0 < request <= self._request:
+            raise RemoteWireError(f"an answer to request {request}, which nobody made")
+
+    def _bound(self) -> Replica:
+        if self._replica is None:
+            raise RemoteWireError("the node speaks of a scan before one is open")
+        return self._replica
+
+
+def _settle(answer: asyncio.Future[Answer], value: Answer | Exception) -> None:
+    """Give an answer to whoever waits for it, unless they were cancelled in this very turn of the loop."""
+    if answer.done():
+        return
+    if isinstance(value, Exception):
+        answer.set_exception(value)
+    else:
+        answer.set_result(value)
