@@ -15,7 +15,9 @@ export async function decodeLift(
   const count = height * width;
   const misses = unpack(await inflate(payload, 6 * count + 8), count);
   const values = synthesise(misses, height, width, quantum);
-  return Uint16Array.from(values, (value) => Math.min(Math.max(value, 1), STEPS_MAX));
+  const steps = new Uint16Array(count);
+  for (let index = 0; index < count; index++) steps[index] = Math.min(Math.max(values[index]!, 1), STEPS_MAX);
+  return steps;
 }
 
 /** The misses as they travel: two bits each, 3 for "see the escapes"; a byte each, 255 for "see the words". */

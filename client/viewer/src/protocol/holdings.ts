@@ -37,7 +37,8 @@ export class ChannelHoldings {
     let index = 0;
     for (const row of lattice.y.block) {
       for (const column of lattice.x.block) {
-        const [level, heldLevel] = [lattice.level[index]!, this.level[row * columns + column]!];
+        const level = lattice.level[index]!;
+        const heldLevel = this.level[row * columns + column]!;
         const heldRank = this.rank[row * columns + column]!;
         const finer = level < heldLevel && rank >= heldRank;
         const better = level === heldLevel && rank >= heldRank + margin;

@@ -95,8 +95,10 @@ function window(axis: Axis, begin: number, end: number): Window {
     for (let cell = 0, k = 0; cell < cells; cell++) {
       const position = QUARTERS * (start + cell);
       while (k < at.length - 2 && at[k + 1]! <= position) k++;
-      [low[cell], high[cell]] = [local[k]!, local[k + 1]!];
-      [part[cell], whole[cell]] = [position - at[k]!, at[k + 1]! - at[k]!];
+      low[cell] = local[k]!;
+      high[cell] = local[k + 1]!;
+      part[cell] = position - at[k]!;
+      whole[cell] = at[k + 1]! - at[k]!;
     }
   }
   const size = axis.stop.slice(begin, end).map((stop, index) => stop - axis.start[begin + index]!);
@@ -110,17 +112,20 @@ export function rangePatch({ y, x }: Selection, samples: Uint16Array): Uint16Arr
   const across = new Float64Array(y.sample.length * columns);
   for (let row = 0; row < y.sample.length; row++) {
     for (let c = 0; c < columns; c++) {
-      const [low, high] = [samples[row * wide + x.low[c]!]!, samples[row * wide + x.high[c]!]!];
+      const low = samples[row * wide + x.low[c]!]!;
+      const high = samples[row * wide + x.high[c]!]!;
       across[row * columns + c] = low * (x.whole[c]! - x.part[c]!) + high * x.part[c]!;
     }
   }
   for (let r = 0; r < rows; r++) {
-    const [low, high, part] = [y.low[r]! * columns, y.high[r]! * columns, y.part[r]!];
+    const low = y.low[r]! * columns;
+    const high = y.high[r]! * columns;
+    const part = y.part[r]!;
     const rest = y.whole[r]! - part;
     for (let c = 0; c < columns; c++) {
       const sum = across[low + c]! * rest + across[high + c]! * part;
       const whole = y.whole[r]! * x.whole[c]!;
-      patch[r * columns + c] = Math.floor((2 * sum + whole) / (2 * whole));
+      patch[r * columns + c] = ((2 * sum + whole) / (2 * whole)) | 0;
     }
   }
   return patch;
@@ -163,7 +168,9 @@ export function texturePatch({ y, x }: Selection, samples: Uint8Array): Uint8Arr
 function stretch(samples: Uint8Array, row: number, x: Window, way: Float32Array): Float32Array {
   const out = new Float32Array(4 * x.low.length);
   for (let c = 0; c < x.low.length; c++) {
-    const [low, high, share] = [4 * (row + x.low[c]!), 4 * (row + x.high[c]!), way[c]!];
+    const low = 4 * (row + x.low[c]!);
+    const high = 4 * (row + x.high[c]!);
+    const share = way[c]!;
     for (let k = 0; k < 4; k++) out[4 * c + k] = samples[low + k]! + (samples[high + k]! - samples[low + k]!) * share;
   }
   return out;
@@ -249,20 +256,26 @@ export function coarseToRange(coarse: Uint16Array, shape: ChannelShape): Uint16A
   const x = betweenCentres(width, coarseWidth, true);
   const y = betweenCentres(height, shape.coarseHeight, false);
   const dense = new Uint16Array(width * height);
+  // Of each coarse column, blended to one dense row: the weighted sum and the weight of what is measured.
+  const [sum, weight] = [new Float64Array(coarseWidth), new Float64Array(coarseWidth)];
   for (let r = 0; r < height; r++) {
-    const [top, bottom] = [y.low[r]! * coarseWidth, y.high[r]! * coarseWidth];
-    const [down, up] = [y.part[r]!, 2 * height - y.part[r]!];
+    const [top, bottom, down] = [y.low[r]! * coarseWidth, y.high[r]! * coarseWidth, y.part[r]!];
+    const up = 2 * height - down;
     const near = down < height ? top : bottom;
+    for (let k = 0; k < coarseWidth; k++) {
+      const above = coarse[top + k]!;
+      const below = coarse[bottom + k]!;
+      sum[k] = up * above + down * below;
+      weight[k] = (above && up) + (below && down);
+    }
     for (let c = 0; c < width; c++) {
-      const [left, right, east] = [x.low[c]!, x.high[c]!, x.part[c]!];
+      const left = x.low[c]!;
+      const right = x.high[c]!;
+      const east = x.part[c]!;
       if (coarse[near + (east < width ? left : right)] === 0) continue;
       const west = 2 * width - east;
-      const [a, b, e, f] = [coarse[top + left]!, coarse[top + right]!, coarse[bottom + left]!, coarse[bottom + right]!];
-      const total = up * (west * a + east * b) + down * (west * e + east * f);
-      const weight = a && b && e && f
-        ? 4 * width * height
-        : up * ((a && west) + (b && east)) + down * ((e && west) + (f && east));
-      dense[r * width + c] = Math.floor((2 * total + weight) / (2 * weight));
+      const whole = west * weight[left]! + east * weight[right]!;
+      dense[r * width + c] = ((2 * (west * sum[left]! + east * sum[right]!) + whole) / (2 * whole)) | 0;
     }
   }
   return dense;
