@@ -6,36 +6,25 @@ import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-import aiohttp
 import numpy as np
 import pytest
-from aiohttp.test_utils import TestClient, TestServer
 
 from client.shared import open_shared
-from node.config import load_config
-from node.exhibits import Exhibits
 from node.library import About, Library
-from node.live import Live
-from node.serve import NodeServer
-from protocol.messages import PROTOCOL, ServerInfo
 from tests.node.scans import make_grid
+from tests.node.served import Client, served
 
 GRID = make_grid()
-Client = TestClient[aiohttp.web.Request, aiohttp.web.Application]
 
 
 @pytest.fixture(params=[False, True], ids=["private", "shared"])
 async def node(request: pytest.FixtureRequest, tmp_path: Path) -> AsyncIterator[Client]:
     library = Library(tmp_path)
     library.add(GRID, About(0.0))
-    exhibits = Exhibits(library, 32768, 2)
-    config = load_config(None, {"server.insecure": True, "server.shared_cache": request.param})
-    server = NodeServer(config, ServerInfo(PROTOCOL, "id", "name", "0"), exhibits, Live(lambda: None), None)
-    async with TestClient(TestServer(server._app)) as client:
+    async with served(library, shared_cache=request.param) as (client, server):
         server._shared.cached = request.param  # type: ignore[attr-defined]
         client.node = server  # type: ignore[attr-defined]
         yield client
-    exhibits.close()
 
 
 async def plan(node: Client, query: str) -> str:
