@@ -5,37 +5,26 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-import aiohttp
 import msgspec
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType
-from aiohttp.test_utils import TestClient, TestServer
 
-from node.config import load_config
-from node.exhibits import Exhibits
 from node.library import About, Library
-from node.live import Live
-from node.serve import NodeServer
 from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.holdings import Holdings
 from protocol.lattice import Channel
 from protocol.refinement import Refinement
 from tests.node.scans import make_grid
-
-Client = TestClient[aiohttp.web.Request, aiohttp.web.Application]
+from tests.node.served import Client, served
 
 
 @pytest.fixture
 async def node(tmp_path: Path) -> AsyncIterator[Client]:
     library = Library(tmp_path)
     library.add(make_grid(), About(0.0))
-    exhibits = Exhibits(library, 32768, 2)
-    config = load_config(None, {"server.insecure": True})
-    server = NodeServer(config, m.ServerInfo(m.PROTOCOL, "id", "name", "0"), exhibits, Live(lambda: None), None)
-    async with TestClient(TestServer(server._app)) as client:
+    async with served(library) as (client, _):
         yield client
-    exhibits.close()
 
 
 async def opened(node: Client, *codecs: m.CodecName) -> tuple[ClientWebSocketResponse, m.Opened]:
