@@ -27,6 +27,18 @@ async function page(out) {
   const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name]);
   await writeFile(join(out, 'index.html'), html);
   for (const file of await readdir(out)) await squeeze(join(out, file));
+  await writeFile(join(out, 'licenses.txt'), await licenses());
+}
+
+// What is bundled is others' work: their licences travel with it.
+async function licenses() {
+  const { dependencies } = JSON.parse(await readFile('package.json', 'utf8'));
+  const parts = Object.entries(dependencies).map(async ([name, version]) => {
+    const folder = join('node_modules', name);
+    const file = (await readdir(folder)).find((entry) => /^licen[cs]e/i.test(entry));
+    return `${name} ${version}\n\n${await readFile(join(folder, file), 'utf8')}`;
+  });
+  return (await Promise.all(parts)).join(`\n${'-'.repeat(80)}\n\n`);
 }
 
 async function squeeze(path) {

@@ -2,7 +2,6 @@
 
 export const strings = {
   title: 'foveascan',
-  noScript: 'This page needs JavaScript.',
   noWebgl: 'This browser draws no WebGL 2, which the page needs. Any current Firefox, Chrome, Edge or Safari does.',
   tooLarge: 'This graphics card cannot draw a scan of this size.',
   shrunk: (by: number) => `Colour is shown at 1/${by} of its resolution: this graphics card takes no larger picture.`,
@@ -36,7 +35,6 @@ export const strings = {
     none: 'None yet.',
     untitled: 'Scan',
     site: (subject: string, site: string) => [subject, site].filter(Boolean).join(' · '),
-    failed: 'The list of scans cannot be read.',
   },
   scanner: {
     heading: 'Scanner',
@@ -80,7 +78,6 @@ export const strings = {
     second: 'Click the second point.',
     result: (mm: number) => `${mm < 100 ? mm.toFixed(2) : mm.toFixed(1)} mm`,
     straight: 'straight from point to point',
-    clear: 'Measure again',
   },
   pins: {
     heading: 'Pins',

@@ -124,7 +124,7 @@ export class Stage {
     return this.surface?.shrunk ?? 1;
   }
 
-  /** Put the camera where it sees the whole scan from the front. wide: the smallest distance used for a live sweep. */
+  /** Put the camera where it sees the whole scan from the front. */
   frame(): void {
     if (!this.surface) return;
     const bounds = boundsOf(this.surface.info, this.surface.steps);

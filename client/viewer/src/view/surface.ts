@@ -39,7 +39,6 @@ export class Surface {
   private readonly normals: WebGLRenderTarget;
   private readonly normalPass: { scene: Scene; camera: Camera };
   private readonly uniforms: Uniforms;
-  private overlayed: Channel | null = null;
 
   constructor(
     private readonly renderer: WebGLRenderer, readonly info: ScanInfo, snapshot: Omit<Snapshot, 'info'>,
@@ -96,7 +95,6 @@ export class Surface {
 
   /** How to shade, and whose spacing to lay over it. */
   show(shading: Shading, overlay: Channel | null): void {
-    this.overlayed = overlay;
     const levels = this.levels[overlay ?? RANGE];
     this.uniforms['uMode']!.value = SHADINGS.indexOf(shading);
     this.uniforms['uOverlay']!.value = overlay === null ? 0 : 0.5;
@@ -113,11 +111,6 @@ export class Surface {
     (this.uniforms['uKey']!.value as Vector3).set(-0.45, 0.55, 0.8).normalize().transformDirection(camera.matrixWorld);
     (this.uniforms['uFill']!.value as Vector3).set(0.8, 0.05, 0.45).normalize().transformDirection(camera.matrixWorld);
     return triangles;
-  }
-
-  /** Which overlay is on. */
-  get overlay(): Channel | null {
-    return this.overlayed;
   }
 
   dispose(): void {
