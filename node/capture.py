@@ -54,6 +54,21 @@ class CaptureStatus:
     sweeps: int = 0
     why: str = ""
 
+    @property
+    def refusal(self) -> str:
+        """Why no sweep can be asked for now; "" when one can."""
+        match self.phase:
+            case "ready":
+                return ""
+            case "no scanner":
+                return "this node has no scanner: start it with --scanner PATH"
+            case "connecting":
+                return f"the scanner is not connected: {self.why or 'it has not answered yet'}"
+            case "stopped":
+                return "the node is stopping"
+            case _:
+                return "a sweep is running already"
+
 
 @dataclass(frozen=True, slots=True)
 class _Resume:
@@ -98,9 +113,7 @@ class Capture:
     def status(self) -> CaptureStatus:
         """What is going on now."""
         with self._lock:
-            if self._order is not None and self._status.phase == "ready":
-                return replace(self._status, phase="starting", why="")
-            return self._status
+            return self._now()
 
     @property
     def beat_s(self) -> float:
@@ -112,7 +125,7 @@ class Capture:
         self._thread.start()
 
     def request_sweep(self) -> bool:
-        """Ask for a sweep; False when one is running or asked for already."""
+        """Ask for a sweep; False, and nothing will come of it, when the scanner is not ready: see status.refusal."""
         return self._request(SweepRequest())
 
     def request_resume(self, sweep_id: str) -> bool:
@@ -131,11 +144,17 @@ class Capture:
 
     def _request(self, order: SweepRequest | _Resume) -> bool:
         with self._lock:
-            if self._status.phase == "sweeping" or self._order is not None:
+            if self._now().refusal:
                 return False
             self._order = order
         self._wake()
         return True
+
+    def _now(self) -> CaptureStatus:
+        """The status, for whoever holds the lock."""
+        if self._order is not None and self._status.phase == "ready":
+            return replace(self._status, phase="starting", why="")
+        return self._status
 
     def _wake(self) -> None:
         """Have the thread look up from an idle port."""
@@ -152,8 +171,10 @@ class Capture:
             except DriverError as error:
                 if str(error) != self._status.why:
                     log.warning("scanner: %s", error)
-                failures = 0 if self._status.phase == "ready" else failures + 1
-                self._status = replace(self._status, phase="connecting", progress=0.0, why=str(error))
+                failures = 0 if self._status.phase in ("ready", "sweeping") else failures + 1
+                with self._lock:
+                    self._order = None  # for a scanner that went away: the next one must not turn unasked
+                    self._status = replace(self._status, phase="connecting", progress=0.0, why=str(error))
             self._beat()
             self._stop.wait(min(BACKOFF_S[1], BACKOFF_S[0] * 2**min(failures, 8)) * random.uniform(0.5, 1.0))
         self._status = replace(self._status, phase="stopped")
@@ -233,9 +254,9 @@ class Capture:
         except FoveascanError as error:
             self._watch(SweepInterrupted(str(error), None, SweepReport()))
             running.leave(str(error))
-            self._end(str(error))
             if isinstance(error, DriverError):
                 raise
+            self._end(str(error))
 
     def _follow(self, events: SweepEvents, running: RunningSweep) -> None:
         """Hand every event to whom it concerns. Raises FoveascanError."""

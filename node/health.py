@@ -29,9 +29,7 @@ def examine_health(capture: CaptureStatus, library: Library) -> Health:
 
 
 def _of_scanner(capture: CaptureStatus) -> tuple[str, ...]:
-    if capture.phase != "connecting":
-        return ()
-    return (f"the scanner is not connected: {capture.why or 'it has not answered yet'}",)
+    return (capture.refusal,) if capture.phase == "connecting" else ()
 
 
 def _of_disk(library: Library) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ import msgspec
 from aiohttp import web
 
 from node.auth import ROLE, require
-from node.capture import Capture
+from node.capture import Capture, CaptureStatus
 from node.durable import NoRoom
 from node.journal import Interrupted
 from node.library import LATEST, Library, verify
@@ -123,10 +123,9 @@ class LibraryRoutes:
     async def _resume(self, request: web.Request) -> web.Response:
         require(request, "operate")
         sweep = self._interrupted(request)
-        if self._capture is None:
-            raise web.HTTPConflict(text="this node has no scanner: start it with --scanner PATH")
-        if not self._capture.request_resume(sweep.id):
-            raise web.HTTPConflict(text="a sweep is running already")
+        if self._capture is None or not self._capture.request_resume(sweep.id):
+            status = self._capture.status if self._capture else CaptureStatus("no scanner")
+            raise web.HTTPConflict(text=status.refusal or "the scanner was busy: try again")
         return _json(_summary(sweep), status=202)
 
     async def _delete_sweep(self, request: web.Request) -> web.Response:

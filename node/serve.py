@@ -146,10 +146,8 @@ class NodeServer:
 
     async def _sweep(self, request: web.Request) -> web.Response:
         require(request, "operate")
-        if self._capture is None:
-            raise web.HTTPConflict(text="this node has no scanner: start it with --scanner PATH")
-        if not self._capture.request_sweep():
-            raise web.HTTPConflict(text="a sweep is running already")
+        if self._capture is None or not self._capture.request_sweep():
+            raise web.HTTPConflict(text=self._capture_status().refusal or "the scanner was busy: try again")
         return _json(asdict(self._capture_status()), status=202)
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:

@@ -17,7 +17,7 @@ from node import durable
 from node.capture import Capture, CaptureStatus
 from node.journal import Journals
 from node.resume import publish_complete
-from protocol.errors import LibraryError
+from protocol.errors import LibraryError, PortLost
 from protocol.grid import Grid, GridSpec
 from protocol.scanner_messages import RangeColumn, TextureColumn
 from simulators.carriers import PtyPort, serve
@@ -167,6 +167,36 @@ def test_an_idle_scanner_that_is_unplugged_is_noticed_and_found_again(plug: Plug
     node.wait_until("ready")
     assert node.capture.request_sweep()
     assert is_truth(node.grids.get(timeout=WAIT_S))
+
+
+def test_a_scanner_that_is_away_is_not_asked_to_sweep_and_does_not_when_it_comes_back(plug: Plug, node: Node) -> None:
+    node.wait_until("connecting", "tty")
+    assert not node.capture.request_sweep()
+    assert node.capture.status.refusal.startswith("the scanner is not connected: ")
+    plug.plug(device())
+    node.wait_until("ready")
+    assert not node.capture.status.refusal
+
+
+def test_a_sweep_asked_for_of_a_scanner_that_goes_away_is_forgotten(
+    plug: Plug, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    idle, look_up = threading.Event(), threading.Event()
+
+    def watch(scanner: Scanner, listen_s: float) -> None:
+        idle.set()
+        look_up.wait(WAIT_S)
+        raise PortLost("tty: unplugged")
+
+    plug.plug(device())
+    with monkeypatch.context() as patch:
+        patch.setattr(Scanner, "watch", watch)
+        assert idle.wait(WAIT_S)
+        assert node.capture.request_sweep()
+        look_up.set()
+        node.wait_until("connecting", "unplugged")
+    node.wait_until("ready")  # not "starting"
+    assert node.events.empty()
 
 
 def test_the_journal_has_the_columns_while_the_sweep_runs(plug: Plug, node: Node, tmp_path: Path) -> None:

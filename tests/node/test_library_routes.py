@@ -10,6 +10,7 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from node import durable
 from node.auth import ROLE, Role
+from node.capture import CaptureStatus
 from node.library import About, Library
 from node.library_routes import LibraryRoutes
 from protocol.grid import Grid, GridSpec
@@ -40,8 +41,12 @@ class Bench:
         self.deleted: list[str] = []
         self.resumed: list[str] = []
 
+    @property
+    def status(self) -> CaptureStatus:
+        """What Capture offers, as below."""
+        return CaptureStatus("sweeping" if self.is_busy else "ready")
+
     def request_resume(self, sweep_id: str) -> bool:
-        """What Capture offers."""
         self.resumed.append(sweep_id)
         return not self.is_busy
 
