@@ -15,4 +15,4 @@ if "CI" not in os.environ:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--soak", type=int, default=0, metavar="N", help="sweep N times more with random faults")
-    parser.addoption("--scanner", metavar="PATH", help="test with this scanner: a device path, usb:VID:PID[:SERIAL] ...")
+    parser.addoption("--scanner", metavar="PATH", help="test with this scanner: a path, usb:VID:PID[:SERIAL] ...")
