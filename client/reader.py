@@ -29,7 +29,7 @@ from protocol.session import Said
 
 log = logging.getLogger(__name__)
 
-Answer = TypeVar("Answer", Model, Update)
+Answer = TypeVar("Answer", Model, Update, m.Enveloped)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +67,7 @@ class Reader:
         self._request = 0
         self._opening: dict[int, asyncio.Future[Model]] = {}
         self._looking: dict[int, _Looking] = {}
+        self._enveloping: dict[int, asyncio.Future[m.Enveloped]] = {}
         self._news: WeakSet[News] = WeakSet()
         self._refinements = self._samples = self._updates = self._resyncs = 0
         self._apply_s = 0.0
@@ -116,6 +117,16 @@ class Reader:
         finally:
             self._looking.pop(request, None)
 
+    @contextmanager
+    def enveloping(self, request: int) -> Iterator[asyncio.Future[m.Enveloped]]:
+        """While somebody waits to hear how far off each block is."""
+        answer: asyncio.Future[m.Enveloped] = asyncio.get_running_loop().create_future()
+        self._enveloping[request] = answer
+        try:
+            yield answer
+        finally:
+            self._enveloping.pop(request, None)
+
     def is_looking(self, request: int) -> bool:
         """Whether a look is still to be answered."""
         return request in self._looking and self.ended is None
@@ -154,6 +165,9 @@ class Reader:
                 self._bind(said)
             case m.Updated():
                 await self._answer(said, size)
+            case m.Enveloped(request=request):
+                if (asked := self._enveloping.pop(request, None)) is not None:
+                    _settle(asked, said)
             case m.Resync():
                 await self._state(self._bound().state())
             case m.Refused():
@@ -219,6 +233,8 @@ class Reader:
             _settle(look.answer, error)
         elif (opening := self._opening.pop(refused.request, None)) is not None:
             _settle(opening, error)
+        elif (asked := self._enveloping.pop(refused.request, None)) is not None:
+            _settle(asked, error)
         else:
             log.warning("%s, about request %d, which nobody waits for", error, refused.request)
 
@@ -229,6 +245,9 @@ class Reader:
                 _settle(opening, cause)
             for look in self._looking.values():
                 _settle(look.answer, cause)
+            for asked in self._enveloping.values():
+                _settle(asked, cause)
+            self._enveloping.clear()
             self._opening.clear()
             self._looking.clear()
             for news in list(self._news):

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import re
+import zlib
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any, Literal, NamedTuple, overload
 
 import aiohttp
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from client.classic_model import ClassicModel
 from client.discovery import NodeAddress
@@ -25,7 +28,7 @@ from client.rest import ask
 from client.stream import Stream, open_stream
 from client.update import Update
 from protocol import messages as m
-from protocol.errors import LocalWireError
+from protocol.errors import LocalWireError, RemoteWireError
 from protocol.holdings import LevelArray, RankArray
 from protocol.lattice import Channel
 
@@ -103,6 +106,18 @@ class Session:
         with self._reader.opening(request) as answer:
             await self._send(m.Open(request, scan, profile=profile))
             return await answer
+
+    async def error_envelope(self) -> NDArray[np.float32]:
+        """How far off the model's range still is, by the node's account. (blocks_y, blocks_x) float32 [mm]
+
+        The largest error of every 8 x 8 block that is measured. Raises LocalWireError when no scan is open,
+        RequestRefused for the classic profile, RemoteWireError for an answer that does not fit the scan.
+        """
+        model = self._opened_model()
+        request = self._reader.new_request()
+        with self._reader.enveloping(request) as answer:
+            await self._send(m.Envelope(request))
+            return error_envelope_mm(await answer, model)
 
     async def look(
         self,
@@ -232,3 +247,17 @@ def _plainly(problem: str) -> str:
     place = re.sub("[A-Z]", lambda letter: f"_{letter[0].lower()}", at.strip("`").removeprefix("$").removeprefix("."))
     what = what.replace("`", "").replace("Expected", "expected")
     return f"{place}: {what}" if place else what
+
+
+def error_envelope_mm(said: m.Enveloped, model: Model) -> NDArray[np.float32]:
+    """The errors of an `enveloped`. (blocks_y, blocks_x) float32 [mm]. Raises RemoteWireError where they do not fit."""
+    shape = model.shapes[Channel.RANGE].blocks
+    size = 2 * shape[0] * shape[1]
+    inflater = zlib.decompressobj(-15)
+    try:
+        errors = inflater.decompress(said.errors, size + 1)
+    except zlib.error as error:
+        raise RemoteWireError(f"enveloped: {error}") from None
+    if len(errors) != size or not inflater.eof:
+        raise RemoteWireError(f"enveloped: {len(errors)} bytes of errors for {shape} blocks")
+    return np.frombuffer(errors, "<u2").reshape(shape).astype(np.float32) * np.float32(model.info.step_mm)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -63,6 +64,14 @@ class Bound:
         self.state = update.state
         self.next_seq += len(coded)
         return [refinement.to_bytes() for refinement in refinements]
+
+    def enveloped(self, request: int) -> m.Enveloped:
+        """How far off each block of range still is. Raises LatticeError for a profile that keeps no account of it."""
+        if isinstance(self.state, ClassicState):
+            raise LatticeError("the classic profile keeps no account of errors block by block")
+        deflater = zlib.compressobj(wbits=-15)
+        errors = deflater.compress(self.state.error.astype("<u2").tobytes()) + deflater.flush()
+        return m.Enveloped(request, self.epoch, errors)
 
     def adopt_word(self, said: m.State) -> None:
         """Take the client's word for what it holds. Raises RemoteWireError when it is no statement of this opening."""

@@ -136,9 +136,19 @@ class Connection:
                     await self._take_ack(message)
                 case m.State():
                     await self._take_state(message)
+                case m.Envelope():
+                    await self._send(await self._enveloped(message.request))
                 case m.Watch(live=live):
                     self._place = Place() if live else None
                     self._live_news.set()
+
+    async def _enveloped(self, request: int) -> m.Enveloped | m.Refused:
+        if self._bound is None:
+            return m.Refused(request, "not open", "open a scan first")
+        try:
+            return await self._exhibits.work(partial(self._bound.enveloped, request))
+        except LatticeError as error:
+            return m.Refused(request, "bad request", str(error))
 
     async def _receive(self) -> m.Message | None:
         """The next message, or None when the stream has ended. Raises RemoteWireError."""

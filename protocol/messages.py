@@ -193,6 +193,17 @@ class Published(_Message, frozen=True):
     scan: ShortText
 
 
+class Enveloped(_Message, frozen=True):
+    """How far off range still is: the largest error of every 8 x 8 block of what the client holds.
+
+    errors : uint16, little-endian, in steps, in row order, raw deflate; base64 on the wire.
+    """
+
+    request: Count
+    epoch: Epoch
+    errors: bytes
+
+
 class LiveStarted(_Message, frozen=True):
     """A sweep runs, and this client watches it: columns of its coarse grids follow as they come in.
 
@@ -311,6 +322,12 @@ class Cancel(_Message, frozen=True):
     request: Count
 
 
+class Envelope(_Message, frozen=True):
+    """Ask how far off range still is, block by block."""
+
+    request: Count
+
+
 class Watch(_Message, frozen=True):
     """Show me sweeps while they run (the one that runs now from its beginning), or show them no more."""
 
@@ -319,9 +336,9 @@ class Watch(_Message, frozen=True):
 
 FromNode = (
     ServerInfo | Welcome | Opened | Updated | Resync | Published | Refused | Goodbye
-    | LiveStarted | LiveProgress | LiveEnded
+    | Enveloped | LiveStarted | LiveProgress | LiveEnded
 )  # fmt: skip
-FromClient = Hello | Open | Look | Ack | State | Cancel | Watch
+FromClient = Hello | Open | Look | Ack | State | Cancel | Envelope | Watch
 Message = FromNode | FromClient
 
 _encoder = msgspec.json.Encoder()

@@ -44,8 +44,8 @@ class Phase(Enum):
 Said = m.Message | Refinement | LiveColumns
 
 _LIVE = (m.LiveStarted, m.LiveProgress, m.LiveEnded, LiveColumns)
-_SERVING = (m.Opened, m.Updated, m.Resync, m.Published, m.Refused, m.Goodbye, Refinement, *_LIVE)
-_ASKING = (m.Open, m.Look, m.Ack, m.State, m.Cancel, m.Watch)
+_SERVING = (m.Opened, m.Updated, m.Resync, m.Published, m.Refused, m.Goodbye, m.Enveloped, Refinement, *_LIVE)
+_ASKING = (m.Open, m.Look, m.Ack, m.State, m.Cancel, m.Envelope, m.Watch)
 _MAY_SAY: dict[tuple[Role, Phase], tuple[type, ...]] = {
     (Role.NODE, Phase.NEW): (m.ServerInfo,),
     (Role.NODE, Phase.GREETED): (m.Refused, m.Goodbye),

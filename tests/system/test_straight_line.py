@@ -162,6 +162,18 @@ async def test_a_newer_look_supersedes_older_ones(head_node: RunningNode) -> Non
         assert "superseded" in {update.reason for update in updates}
 
 
+async def test_the_error_envelope_holds_every_block(head_node: RunningNode) -> None:
+    async with connect(head_node.url) as session:
+        model = await session.open()
+        for _ in range(2):
+            error = np.abs(model.range_steps.astype(int) - head_node.truth.range_steps) * head_node.truth.step_mm
+            error[head_node.truth.range_steps == 0] = 0
+            starts = [np.arange(0, size, RANGE_BLOCK) for size in error.shape]
+            blocks = np.maximum.reduceat(np.maximum.reduceat(error, starts[0], axis=0), starts[1], axis=1)
+            np.testing.assert_allclose(await session.error_envelope(), blocks, atol=1e-4)
+            await session.look(0.5, 0.5)
+
+
 @pytest.mark.parametrize("max_bytes", [0, 300, 1000, 3000, 8000])
 async def test_never_a_byte_over_the_limit(head_node: RunningNode, max_bytes: int) -> None:  # AT-12, explicit limits
     async with connect(head_node.url) as session:
