@@ -34,6 +34,8 @@ EVERY: list[m.Message] = [
     m.State(2, 5, STATEMENT),
     m.Cancel(1),
     m.Watch(True),
+    m.Envelope(1),
+    m.Enveloped(1, 2, b"\x03\x00"),
 ]
 
 
