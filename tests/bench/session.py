@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from tests.bench.cache import Cache
 from tests.bench.ours import Looked, look, node_with
-from tests.bench.rivals import jpip
 from tests.bench.rivals.caching import (
     Windows,
     jpip_session,
@@ -21,7 +20,7 @@ from tests.bench.rivals.caching import (
     windows_of,
     with_replies,
 )  # fmt: skip
-from tests.bench.rivals.contestants import as_large_as_ours
+from tests.bench.rivals.contestants import as_coarse_as_ours, as_large_as_ours
 from tests.bench.rivals.offer import Unreachable, straight
 from tests.bench.roi import geometric_mean
 from tests.bench.scans import SEED, BenchScan, Click, Skipped
@@ -114,8 +113,8 @@ def _rival_bytes(rival: str, scan: BenchScan, clicks: list[Click], target: Targe
 
 def _sent(rival: str, scan: BenchScan, windows: Windows, cache: Cache) -> list[int]:
     if rival.startswith("JPIP"):
-        free = as_large_as_ours(scan) if rival.endswith("first view") else jpip.AS_COARSE_AS_OURS
-        return with_replies(jpip_session(scan, windows, cache, free))
+        free = as_large_as_ours if rival.endswith("first view") else as_coarse_as_ours
+        return with_replies(jpip_session(scan, windows, cache, free(scan)))
     return with_replies(range_session(scan, windows), texture_sessions(scan, windows, rival.split()[0].lower()))
 
 

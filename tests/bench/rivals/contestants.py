@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
 
-from node.first_view import build_first_view
+from node.first_view import FirstView, build_first_view
 from tests.bench.cache import Cache
 from tests.bench.rivals import draco_range, htj2k_texture, jpeg_texture, jpeg_whole, jpip, range_tiles
+from tests.bench.rivals.codestream import RESOLUTIONS
 from tests.bench.rivals.offer import Offer, reply, straight
 from tests.bench.scans import BenchScan, Click
 from tests.bench.target import Target, Window
@@ -21,42 +23,59 @@ Part = Callable[[BenchScan, Window, Cache], Offer]
 
 
 @lru_cache(maxsize=8)
-def as_large_as_ours(scan: BenchScan) -> dict[str, jpip.Free]:
-    """What a JPIP client may hold of a scan before any click, when it is given the bytes of our first view."""
+def our_first_view(scan: BenchScan) -> FirstView:
+    """What our clients hold of a scan before any click."""
     with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
-        view = build_first_view(scan.published(Path(folder)), "htj2k", FIRST_VIEW_BYTES)
+        return build_first_view(scan.published(Path(folder)), "htj2k", FIRST_VIEW_BYTES)
+
+
+def as_coarse_as_ours(scan: BenchScan) -> dict[str, jpip.Free]:
+    """What a JPIP client holds before any click, given the resolutions that our first view has."""
+    info = our_first_view(scan).info
+    spacings = {"range": info.width / info.coarse_width, "texture": info.texture_width / info.coarse_texture_width}
+    return {name: jpip.Free(RESOLUTIONS - round(math.log2(spacing))) for name, spacing in spacings.items()}
+
+
+def as_large_as_ours(scan: BenchScan) -> dict[str, jpip.Free]:
+    """What a JPIP client holds before any click, given the bytes that our first view has."""
+    view = our_first_view(scan)
     sizes = {"range": len(view.range.payload) + len(view.range.mask), "texture": len(view.texture.payload)}
     return {channel: jpip.Free(size_bytes=size) for channel, size in sizes.items()}
+
+
+FIRST_VIEWS = {"coarse": as_coarse_as_ours, "large": as_large_as_ours}
+
+
+def _jpip(channel: str, first_view: str, scan: BenchScan, window: Window, cache: Cache) -> Offer:
+    offer = jpip.range_offer if channel == "range" else jpip.texture_offer
+    return offer(scan, window, cache, FIRST_VIEWS[first_view](scan)[channel])
 
 
 PARTS: Mapping[str, Part] = {
     "draco_full": draco_range.full_offer,
     "draco_tiles": lambda scan, window, _: draco_range.tiles_offer(scan, window),
     "range_tiles": lambda scan, window, _: range_tiles.range_offer(scan, window),
-    "jpip_range": partial(jpip.range_offer, free=jpip.AS_COARSE_AS_OURS["range"]),
-    "jpip_range_large": lambda scan, window, cache: jpip.range_offer(
-        scan, window, cache, as_large_as_ours(scan)["range"]
-    ),
+    "jpip_range_coarse": partial(_jpip, "range", "coarse"),
+    "jpip_range_large": partial(_jpip, "range", "large"),
     "jpeg_full": jpeg_whole.texture_offer,
     "progressive_jpeg": jpeg_whole.progressive_offer,
     "jpeg_tiles": lambda scan, window, _: jpeg_texture.texture_offer(scan, window),
     "htj2k_tiles": lambda scan, window, _: htj2k_texture.texture_offer(scan, window),
-    "jpip_texture": partial(jpip.texture_offer, free=jpip.AS_COARSE_AS_OURS["texture"]),
-    "jpip_texture_large": lambda scan, window, cache: jpip.texture_offer(
-        scan, window, cache, as_large_as_ours(scan)["texture"]
-    ),
+    "jpip_texture_coarse": partial(_jpip, "texture", "coarse"),
+    "jpip_texture_large": partial(_jpip, "texture", "large"),
 }
 SOURCES = {
-    "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles", "jpip_range": "jpip",
+    "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles", "jpip_range_coarse": "jpip",
     "jpip_range_large": "jpip", "jpeg_full": "jpeg_whole", "progressive_jpeg": "jpeg_whole",
-    "jpeg_tiles": "jpeg_texture", "htj2k_tiles": "htj2k_texture", "jpip_texture": "jpip", "jpip_texture_large": "jpip",
+    "jpeg_tiles": "jpeg_texture", "htj2k_tiles": "htj2k_texture", "jpip_texture_coarse": "jpip",
+    "jpip_texture_large": "jpip",
 }  # fmt: skip
 RIVALS: Mapping[str, tuple[str, str]] = {
     "full Draco + JPEG": ("draco_full", "jpeg_full"),
     "Draco + JPEG tiles": ("draco_tiles", "jpeg_tiles"),
     "JPEG tile pyramid": ("range_tiles", "jpeg_tiles"),
     "HTJ2K tile pyramid": ("range_tiles", "htj2k_tiles"),
-    "JPIP": ("jpip_range", "jpip_texture"),
+    "JPIP": ("jpip_range_coarse", "jpip_texture_coarse"),
     "JPIP, as large a first view": ("jpip_range_large", "jpip_texture_large"),
     "progressive JPEG": ("range_tiles", "progressive_jpeg"),
 }
@@ -80,5 +99,6 @@ def part(name: str, scan: BenchScan, click: Click, target: Target, cache: Cache)
 
 
 def edition(name: str, scan: BenchScan) -> str:
-    """What a part's result hangs on beside its own source: our first view, where it is given as much."""
-    return f" {as_large_as_ours(scan)}" if name.endswith("_large") else ""
+    """What a result hangs on beside its own source: our first view, where a rival is given one like it."""
+    first_view = FIRST_VIEWS.get(name.rpartition("_")[2])
+    return f" {first_view(scan)}" if first_view else ""

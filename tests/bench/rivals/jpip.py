@@ -45,9 +45,6 @@ class Free:
     size_bytes: int = 1 << 30
 
 
-AS_COARSE_AS_OURS = {"range": Free(resolutions=3), "texture": Free(resolutions=3)}
-
-
 def texture_offer(scan: BenchScan, window: Window, cache: Cache, free: Free) -> Offer:
     """The cheapest packets that show the window at the target's PSNR."""
     layouts = [Layout(*cut, layers) for cut in CUTS for layers in TEXTURE_DB]
