@@ -65,10 +65,11 @@ PARTS: Mapping[str, Part] = {
     "jpip_texture_large": partial(_jpip, "texture", "large"),
 }
 SOURCES = {
-    "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles", "jpip_range_coarse": "jpip",
-    "jpip_range_large": "jpip", "jpeg_full": "jpeg_whole", "progressive_jpeg": "jpeg_whole",
-    "jpeg_tiles": "jpeg_texture", "htj2k_tiles": "htj2k_texture", "jpip_texture_coarse": "jpip",
-    "jpip_texture_large": "jpip",
+    "draco_full": "draco_range", "draco_tiles": "draco_range", "range_tiles": "range_tiles",
+    "jpip_range_coarse": "jpip", "jpip_range_large": "jpip",
+    "jpip_texture_coarse": "jpip", "jpip_texture_large": "jpip",
+    "jpeg_full": "jpeg_whole", "progressive_jpeg": "jpeg_whole",
+    "jpeg_tiles": "jpeg_texture", "htj2k_tiles": "htj2k_texture",
 }  # fmt: skip
 RIVALS: Mapping[str, tuple[str, str]] = {
     "full Draco + JPEG": ("draco_full", "jpeg_full"),
