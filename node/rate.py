@@ -22,6 +22,7 @@ class RateControl:
 
     def __init__(self, cold_start_bytes_s: float) -> None:
         self.bandwidth_bytes_s = cold_start_bytes_s
+        self._is_guess = True
         self._round_trip_s: float | None = None
         self._apply_s = 0.0
         self._encode_s: deque[float] = deque(maxlen=ENCODES_KEPT)
@@ -43,13 +44,15 @@ class RateControl:
         """size_bytes were acknowledged elapsed_s after the first was sent; apply_s of that went into applying them."""
         self._apply_s = apply_s
         travel_s = elapsed_s - apply_s - self.round_trip_s
-        if size_bytes < SAMPLE_BYTES_MIN:
+        if size_bytes < SAMPLE_BYTES_MIN and not self._is_guess:
             if elapsed_s > apply_s:
                 self.pinged(elapsed_s - apply_s)
             return
         sample = size_bytes / travel_s if travel_s > 0 else self.bandwidth_bytes_s * RISE_MAX
         sample = min(sample, self.bandwidth_bytes_s * RISE_MAX)
-        mixed = (1 - WEIGHT) * self.bandwidth_bytes_s + WEIGHT * sample
+        weight = 1.0 if self._is_guess else WEIGHT  # the first view already tells more than any configured value
+        self._is_guess = False
+        mixed = (1 - weight) * self.bandwidth_bytes_s + weight * sample
         self.bandwidth_bytes_s = min(max(mixed, BANDWIDTH_BYTES_S[0]), BANDWIDTH_BYTES_S[1])
 
     def budget_bytes(self, wait_s: float) -> int:
