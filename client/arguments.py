@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 
 TIMEOUT_MAX_S = 3600
+BYTES_MAX = 1 << 40
 
 
 def add_search(parser: argparse.ArgumentParser) -> None:
@@ -60,6 +62,33 @@ def positive(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
     return value
+
+
+def between(low: float, high: float) -> Callable[[str], float]:
+    """A number from low to high."""
+
+    def bounded(text: str) -> float:
+        value = number(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"expected a number from {low:g} to {high:g}, got {text}")
+        return value
+
+    return bounded
+
+
+def share(text: str) -> float:
+    """A number above 0, at most 1."""
+    value = number(text)
+    if not 0 < value <= 1:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, at most 1, got {text}")
+    return value
+
+
+def byte_count(text: str) -> int:
+    """A whole number of bytes, at most 2^40."""
+    if not (text.isascii() and text.isdigit() and len(text) <= 13 and int(text) <= BYTES_MAX):
+        raise argparse.ArgumentTypeError(f"expected a whole number of bytes, at most {BYTES_MAX}, got {text!r}")
+    return int(text)
 
 
 def seconds(text: str) -> float:

@@ -40,9 +40,9 @@ def run_export(args: argparse.Namespace) -> int:
     """Fetch the file; print its size."""
     import asyncio
 
-    from exchange.formats import suffix_of
+    from client.export import check_target
 
-    suffix_of(args.file)
+    check_target(args.file)
     size = asyncio.run(_export(args))
     record = {"file": str(args.file), "bytes": size}
     print(json.dumps(record) if args.json else f"{args.file}: {size} bytes", flush=True)
@@ -55,6 +55,8 @@ def run_import(args: argparse.Namespace) -> int:
 
     from exchange.formats import read_scan
 
+    if args.output:
+        _check_grid(args.output)
     with _bar(args, "reading") as moved:
         options = _mesh_options(args)
         name, grid = read_scan(args.file, args.texture, options, lambda share: moved(round(1000 * share), 1000))
@@ -89,13 +91,19 @@ async def _import(args: argparse.Namespace, name: str, grid: Grid) -> str:
         return await send_scan(url, file, token=args.token, moved=moved)
 
 
-def _write(path: Path, name: str, grid: Grid) -> None:
+def _check_grid(path: Path) -> None:
     from exchange.errors import ExchangeError
-    from exchange.native import write_native
-    from exchange.whole_file import whole_file
+    from exchange.whole_file import check_place
 
     if path.suffix.lower() != ".npz":
         raise ExchangeError(f"{path}: only .npz is written here; send it to a node and use `foveascan export`")
+    check_place(path)
+
+
+def _write(path: Path, name: str, grid: Grid) -> None:
+    from exchange.native import write_native
+    from exchange.whole_file import whole_file
+
     with whole_file(path) as file:
         write_native(grid, file, name)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from exchange.formats import suffix_of, writer_of
-from exchange.whole_file import whole_file
+from exchange.whole_file import check_place, whole_file
 from protocol.grid import Grid
 
 
-def check_suffix(path: str | Path) -> None:
-    """Raises ExchangeError when a file of this name cannot be written, before any work is done for it."""
+def check_target(path: str | Path) -> None:
+    """Raises ExchangeError for a suffix that we do not write, OSError for a place; before any work is done for it."""
     suffix_of(path)
+    check_place(path)
 
 
 def write_grid(grid: Grid, path: str | Path) -> None:

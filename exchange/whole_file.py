@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,11 +18,34 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     target = Path(path)
     temporary = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}")
     try:
-        with open(temporary, "x+b") as file:
+        with _named(target):
+            file = open(temporary, "x+b")
+        with file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, target)
+        with _named(target):
+            os.replace(temporary, target)
     except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
+
+
+def check_place(path: str | Path) -> None:
+    """Raises OSError where `whole_file` could not write, before any work is done for it. Leaves nothing there."""
+    target = Path(path)
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
+    with _named(target), tempfile.TemporaryFile(dir=target.parent):
+        pass
+
+
+@contextmanager
+def _named(target: Path) -> Iterator[None]:
+    """Errors of the file system name what was to be written, not how it is done."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            error.filename, error.filename2 = str(target), None
         raise

@@ -17,7 +17,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     serve.add_argument("--listen", metavar="HOST:PORT", help="address to serve (127.0.0.1:7345); port 0: any free one")
     serve.add_argument("--insecure", action="store_true", default=None, help="plain HTTP without login, loopback only")
     serve.add_argument("--scanner", metavar="PATH", help="serial port of the scanner; none: library only")
-    serve.add_argument("--baud", type=int, help="its speed in baud (3000000)")
+    serve.add_argument("--baud", type=_baud, help="its speed in baud, 9600..12000000 (3000000)")
     serve.add_argument("--name", help="name to announce on the network (this host's)")
     serve.add_argument("--json", action="store_true", help="print one JSON object once the node is ready")
     serve.set_defaults(run=run_serve)
@@ -28,6 +28,13 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     doctor.add_argument("--library", metavar="DIR", help="folder the scans are kept in, instead of the one set there")
     doctor.add_argument("--json", action="store_true", help="print one JSON object a check")
     doctor.set_defaults(run=run_doctor)
+
+
+def _baud(text: str) -> int:
+    """A speed that configuration knows. Raises ArgumentTypeError."""
+    if not (text.isascii() and text.isdigit() and len(text) <= 8 and 9600 <= int(text) <= 12_000_000):
+        raise argparse.ArgumentTypeError(f"expected 9600..12000000 baud, got {text!r}")
+    return int(text)
 
 
 def run_serve(args: argparse.Namespace) -> int:

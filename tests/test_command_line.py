@@ -49,7 +49,10 @@ def test_version_is_the_one_of_the_distribution() -> None:
     assert foveascan_process("--version").stdout == f"foveascan {version('foveascan')}\n"
 
 
-@pytest.mark.parametrize("arguments", [(), ("no-such-command",), ("demo", "--size", "XL"), ("demo", "--siz", "S")])
+@pytest.mark.parametrize(
+    "arguments",
+    [(), ("no-such-command",), ("demo", "--size", "XL"), ("demo", "--siz", "S"), ("serve", "--baud", "5")],
+)
 def test_wrong_usage_is_status_2_and_a_hint(arguments: tuple[str, ...]) -> None:
     done = foveascan_process(*arguments)
     assert (done.returncode, done.stdout) == (2, "")

@@ -4,6 +4,7 @@ import argparse
 import asyncio
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ import pytest
 from aiohttp import web
 
 from client import NodeLost, RequestRefused, command, discovery
+from client.command import _update_line
 from client.discovery import NodeAddress
+from client.session import _checked_look
+from client.update import Tally
 from exchange.errors import ExchangeError
 from protocol import messages as m
 from protocol.errors import LocalWireError, ScannerFault
@@ -22,11 +26,15 @@ GRID = synthetic_grid()
 NODE = NodeAddress("one", "127.0.0.1", 7345, "id-one", "ready", False)
 
 
-def run(*arguments: str) -> int:
-    """A subcommand as `foveascan` runs it."""
+def parse(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     command.add_subcommands(parser.add_subparsers(required=True))
-    args = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def run(*arguments: str) -> int:
+    """A subcommand as `foveascan` runs it."""
+    args = parse(*arguments)
     status: int = args.run(args)
     return status
 
@@ -115,9 +123,48 @@ def test_look_passes_a_refusal_on() -> None:
         run("look", "--node", url, "--scan", "nope")
 
 
-def test_look_out_of_bounds_is_named() -> None:
-    with serving_in_thread(show_and_answer) as url, pytest.raises(LocalWireError, match="window"):
-        run("look", "--node", url, "--window", "2")
+def test_a_complete_look_does_not_promise_its_largest_error() -> None:
+    blank = Tally(1).close(m.Updated(1, 2, "complete", error_max_mm=1.22))
+    assert "range 99% within 0.1 mm, all within 1.22 mm" in _update_line(0.5, 0.5, blank, 0.1)
+    cut = replace(blank, reason="byte limit")
+    assert cut.reason in (line := _update_line(0.5, 0.5, cut, 0.1)) and "99%" not in line
+
+
+def test_look_checks_where_to_write_before_it_connects(tmp_path: Path) -> None:
+    target = tmp_path / "none" / "model.glb"
+    for arguments in (("look", "-o", str(target)), ("export", str(target))):
+        with pytest.raises(FileNotFoundError) as refused:
+            run(*arguments, "--node", "http://127.0.0.1:9")
+        assert refused.value.filename == str(target)
+
+
+BOUNDS = {
+    "--window": ("window", ["0", "-1", "1.01", "2"], ["0.001", "1"]),
+    "--texture-db": ("texture_db", ["9.9", "101"], ["10", "100"]),
+    "--range-mm": ("range_mm", ["-0.1", "1001"], ["0", "1000"]),
+    "--max-wait": ("max_wait_s", ["0", "31"], ["0.05", "30"]),
+    "--max-bytes": ("max_bytes", ["-1", "1.5", str((1 << 40) + 1)], ["0", str(1 << 40)]),
+}
+
+
+@pytest.mark.parametrize("option", BOUNDS)
+def test_a_look_out_of_bounds_is_wrong_usage_where_a_stream_would_refuse_it(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field, wrong, right = BOUNDS[option]
+    for text in wrong:
+        with pytest.raises(SystemExit) as end:
+            parse("look", f"{option}={text}")
+        assert end.value.code == 2 and f"{option}: expected" in capsys.readouterr().err
+        with pytest.raises(LocalWireError):
+            _checked_look(replace_field(field, float(text)))
+    for text in right:
+        value = getattr(parse("look", f"{option}={text}"), option[2:].replace("-", "_"))
+        assert getattr(_checked_look(replace_field(field, value)), field) == value
+
+
+def replace_field(field: str, value: float) -> m.Look:
+    return m.Look(1, 0.5, 0.5, **{field: value})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

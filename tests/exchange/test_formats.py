@@ -10,7 +10,7 @@ import trimesh
 from exchange.errors import ExchangeError
 from exchange.formats import MeshOptions, read_scan, suffix_of
 from exchange.image import encode_png, read_image
-from exchange.whole_file import whole_file
+from exchange.whole_file import check_place, whole_file
 
 
 @pytest.mark.parametrize(("name", "suffix"), [("a.glb", ".glb"), ("A.OBJ.ZIP", ".obj.zip"), ("d/x.y.npz", ".npz")])
@@ -79,6 +79,18 @@ def test_a_whole_file_appears_at_the_end_and_replaces_what_was_there(tmp_path: P
         file.write(b"new")
         assert target.read_bytes() == b"old"
     assert target.read_bytes() == b"new" and list(tmp_path.iterdir()) == [target]
+
+
+def test_a_place_that_cannot_be_written_is_named_by_the_target_alone(tmp_path: Path) -> None:
+    target = tmp_path / "none" / "model.glb"
+    for attempt in (check_place, lambda path: whole_file(path).__enter__()):
+        with pytest.raises(FileNotFoundError) as refused:
+            attempt(target)
+        assert refused.value.filename == str(target) and str(refused.value).count("'") == 2
+    with pytest.raises(IsADirectoryError, match=str(tmp_path)):
+        check_place(tmp_path)
+    check_place(tmp_path / "model.glb")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failed_write_leaves_the_older_file_and_nothing_beside_it(tmp_path: Path) -> None:
