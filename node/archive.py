@@ -194,7 +194,10 @@ class _TarReader:
 
 def _unpack(reader: _TarReader, staged: Path) -> list[str]:
     """Write a backup's scans into a folder, compared with its checksums. Returns their ids."""
-    name, _ = reader.next_member()
+    try:
+        name, _ = reader.next_member()
+    except LibraryError as error:
+        raise LibraryError("not a backup of a library: it does not begin as one") from error
     if name != MARK:
         raise LibraryError(f"not a backup of a library: it begins with {name[:80]!r}")
     mark_data = reader.read_small(_MARK_BYTES_MAX)

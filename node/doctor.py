@@ -1,6 +1,7 @@
 """What may keep a node from working on this machine: each check says what it found, and the cure.
 
 Nothing is changed, no lock is taken, and a port is opened only while no node uses it: a doctor may come at any time.
+Whether a disk takes a file is tried with one that has no name.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 import shutil
 import socket
 import stat
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -40,6 +42,7 @@ from node.machine import (
 )
 from node.scan_folder import name_problems
 from protocol.errors import ConfigError, LibraryError
+from protocol.printable import counted
 
 RULE = "70-foveascan.rules"
 SWEEP_M_BYTES = 1440 * 1024 * 2 + 4096 * 2048 * 3
@@ -152,13 +155,15 @@ def check_server(server: settings.Server, who: str) -> Finding:
 
 def check_disk(folder: Path, account: Account) -> Finding:
     """Whether the library can be written, and holds another sweep of the largest size."""
-    there = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
+    there = _nearest(folder)
     if not there.is_dir() or not account.may(there.stat(), READ | WRITE | SEARCH):
         cure = f"chown -R {account.name} {folder}, or choose another library.folder"
         return Finding("disk", "problem", f"{account.name} may not write in {there}", cure)
     if os.statvfs(there).f_flag & os.ST_RDONLY:
         cure = "mount it anew, or choose another library.folder"
         return Finding("disk", "problem", f"{there} is mounted read-only", cure)
+    if why := _refusal(there):
+        return Finding("disk", "problem", f"nothing can be kept in {there}: {why}", "choose another library.folder")
     free = shutil.disk_usage(there).free
     found = f"{_size(free)} free in {there}"
     if free < DISK_MIN_BYTES:
@@ -213,17 +218,34 @@ def check_discovery(config: settings.Config, is_running: bool) -> Finding:
 def check_library(folder: Path) -> Finding:
     """Whether the library can be read, and what lies in it that is no sound scan."""
     if not os.path.exists(folder):
+        if why := _refusal(_nearest(folder)):
+            found = f"{folder} is not there, and cannot be made: {why}"
+            return Finding("library", "problem", found, "choose another library.folder")
         return Finding("library", "ok", f"{folder} is not there yet: the node makes it")
     try:
         known, problems = survey(folder)
     except LibraryError as error:
         return Finding("library", "problem", str(error), "choose another library.folder, or restore a backup")
-    found = f"{len(known)} scans in {folder}"
+    found = f"{counted(len(known), 'scan')} in {folder}"
     if not problems:
         return Finding("library", "ok", found)
-    found += f", and {len(problems)} things that are none ({name_problems(problems)})"
+    found += f", and beside them {counted(len(problems), 'thing')}: {name_problems(problems)}"
     cure = "they are left alone: move away what does not belong there, restore damaged scans from a backup"
     return Finding("library", "warning", found, cure)
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, else the closest place above it that is there."""
+    return next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
+
+
+def _refusal(folder: Path) -> str:
+    """Why nothing can be made in a folder; "" when something can."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return ""
+    except OSError as error:
+        return error.strerror or str(error)
 
 
 def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:

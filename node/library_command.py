@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocol.errors import LibraryError
-from protocol.printable import printable
+from protocol.printable import counted, printable
 
 if TYPE_CHECKING:
     from node.library import Library, ScanSummary
@@ -88,6 +88,8 @@ def run_show(args: argparse.Namespace) -> int:
 
 def run_rename(args: argparse.Namespace) -> int:
     """Give a scan another name."""
+    if not args.name.strip():
+        raise LibraryError("name: say what to call the scan; nothing was changed")
     folder = _folder(args)
     scan_id = _resolve(folder, args.scan)
     with _opened(folder) as library:
@@ -95,7 +97,7 @@ def run_rename(args: argparse.Namespace) -> int:
             library.rename(scan_id, args.name, getpass.getuser())
         except ValueError as problem:
             raise LibraryError(f"name: {problem}") from problem
-    return _tell(args, {"id": scan_id, "name": args.name}, f"{scan_id[:12]} is called {args.name} now")
+    return _tell(args, {"id": scan_id, "name": args.name}, f'{scan_id} is called "{printable(args.name)}" now')
 
 
 def run_delete(args: argparse.Namespace) -> int:
@@ -124,7 +126,7 @@ def run_verify(args: argparse.Namespace) -> int:
         problems += others
     said = {"checked": len(ids), "problems": [[problem.name, problem.reason] for problem in problems]}
     lines = [f"{problem.name}: {problem.reason}" for problem in problems]
-    _tell(args, said, "\n".join([*lines, f"{len(ids)} scans checked, {len(problems)} problems"]))
+    _tell(args, said, "\n".join([*lines, f"{counted(len(ids), 'scan')} checked, {counted(len(problems), 'problem')}"]))
     return 1 if problems else 0
 
 
@@ -138,19 +140,27 @@ def run_backup(args: argparse.Namespace) -> int:
     backup(folder, ids, args.file)
     size_bytes = args.file.stat().st_size
     said = {"file": str(args.file), "scans": len(ids), "bytes": size_bytes}
-    return _tell(args, said, f"{len(ids)} scans, {size_bytes} bytes in {args.file}")
+    return _tell(args, said, f"{counted(len(ids), 'scan')}, {counted(size_bytes, 'byte')} in {args.file}")
 
 
 def run_restore(args: argparse.Namespace) -> int:
     """Take a backup in."""
-    with _opened(_folder(args)) as library:
+    with _opened(_set_folder(args)) as library:
         restored = library.restore(args.file)
     said = {"added": list(restored.added), "kept": list(restored.kept)}
-    text = f"{len(restored.added)} scans restored, {len(restored.kept)} were here already and stay as they were"
+    text = f"{counted(len(restored.added), 'scan')} restored, {len(restored.kept)} kept that were here already"
     return _tell(args, said, text)
 
 
 def _folder(args: argparse.Namespace) -> Path:
+    """The library that is meant. Raises LibraryError, with a hint, where nobody named one and there is none."""
+    folder = _set_folder(args)
+    if not (args.library or args.config or folder.exists()):
+        raise LibraryError(f"no library in {folder}: name its folder with --library, or settings with --config")
+    return folder
+
+
+def _set_folder(args: argparse.Namespace) -> Path:
     from node.config import load_config
 
     return load_config(args.config, {"library.folder": args.library}).library.path
@@ -184,7 +194,7 @@ def _line(scan: ScanSummary) -> str:
     s = scan.spec
     made = datetime.fromtimestamp(scan.about.created_unix_s).isoformat(" ", "minutes")
     shape = f"{s.width} x {s.height} + {s.texture_width} x {s.texture_height}"
-    return f"{scan.id[:12]}  {made}  {shape}  {printable(scan.about.name)}".rstrip()
+    return f"{scan.id}  {made}  {shape}  {printable(scan.about.name)}".rstrip()
 
 
 def _as_json(scan: ScanSummary) -> dict[str, object]:

@@ -252,10 +252,17 @@ def test_a_library_is_counted_and_what_does_not_belong_there_named(tmp_path: Pat
     spec = GridSpec(16, 8, 32, 16, 0.01, 1.0)
     library = Library(tmp_path)
     library.add(Grid(spec, np.ones((8, 16), np.uint16), np.zeros((16, 32, 3), np.uint8)), About(1.0))
-    assert doctor.check_library(tmp_path) == Finding("library", "ok", f"1 scans in {tmp_path}")
+    assert doctor.check_library(tmp_path) == Finding("library", "ok", f"1 scan in {tmp_path}")
     (tmp_path / "holiday.jpg").touch()
     finding = doctor.check_library(tmp_path)
     assert finding.state == "warning" and "holiday.jpg" in finding.found
+
+
+def test_a_library_that_cannot_be_made_is_a_problem() -> None:
+    folder = Path("/proc/foveascan")
+    library, disk = doctor.check_library(folder), doctor.check_disk(folder, ROOT)
+    assert states(library, disk) == ["problem", "problem"]
+    assert str(folder) in library.found and "cannot be made" in library.found and "/proc" in disk.found
 
 
 def test_a_library_of_a_newer_version_is_a_problem(tmp_path: Path) -> None:

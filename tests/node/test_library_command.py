@@ -77,6 +77,15 @@ def test_a_library_that_is_not_there_is_not_made_by_looking(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
+def test_without_a_library_the_option_that_names_one_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for arguments in (("list",), ("verify",), ("rename", "latest", "x")):
+        with pytest.raises(LibraryError, match=f"no library in {tmp_path}.*--library"):
+            run(*arguments)
+
+
 def test_show_tells_what_is_said(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, knee = ids(folder, capsys)
     run("show", knee[:8], "--library", folder, "--json")
@@ -88,9 +97,19 @@ def test_rename_names_the_scan(folder: Path, capsys: pytest.CaptureFixture[str])
     run("rename", "latest", "elbow", "--library", folder)
     run("list", "--library", folder)
     assert "elbow" in capsys.readouterr().out
-    with pytest.raises(LibraryError, match="name"):
-        run("rename", "latest", "x" * 201, "--library", folder)
+    for name in ("x" * 201, "", " "):
+        with pytest.raises(LibraryError, match="^name: "):
+            run("rename", "latest", name, "--library", folder)
 
+
+def test_list_and_rename_tell_ids_that_every_other_command_takes(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    latest, knee = ids(folder, capsys)
+    run("list", "--library", folder)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [latest, knee]
+    run("rename", "latest", "left\x07 elbow", "--library", folder)
+    assert capsys.readouterr().out == f'{latest} is called "left\\x07 elbow" now\n'
 
 @pytest.mark.parametrize("name", ["", "zz", "0" * 32, "../library"])
 def test_a_scan_nobody_knows_is_refused(folder: Path, name: str) -> None:
@@ -121,7 +140,9 @@ def test_verify_finds_a_rotten_byte(folder: Path, capsys: pytest.CaptureFixture[
     assert run("verify", "--library", folder, "--json") == 1
     ((name, reason),) = said(capsys)["problems"]
     assert name == knee and "not what they were" in reason
+    capsys.readouterr()
     assert run("verify", latest, "--library", folder) == 0
+    assert capsys.readouterr().out == "1 scan checked, 0 problems\n"
 
 
 def test_a_backup_is_restored_elsewhere_with_the_same_ids(
