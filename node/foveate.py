@@ -35,14 +35,17 @@ from node.refine_texture import (
     adopted_error,
     choose_spacing,
     code_texture,
+    code_texture_lattice,
     db_of_mse,
     held_error,
+    listed_texture,
     measured,
     mse_of_db,
     note_texture,
     quality_bounds,
     quality_to_mend,
     select_texture,
+    texture_lattice,
 )
 from node.state import ClientState
 from node.texture_model import Expected, TextureModel
@@ -264,7 +267,7 @@ class _Planner:
     def _try_qualities(self, search: QualitySearch, p: float) -> bool:
         """Feed a search; False when the client holds all of this already."""
         while (quality := search.next_quality()) is not None:
-            coded = self._code_texture(TextureParameters(p, quality, self._codec, self._skirt(p)))
+            coded = self._code_listed(TextureParameters(p, quality, self._codec, self._skirt(p)))
             if coded is None:
                 if self._texture_error(None) <= self._target_mse:
                     return False
@@ -366,6 +369,18 @@ class _Planner:
     def _code_texture(self, wanted: TextureParameters) -> Coded | None:
         self._count_encode()
         return code_texture(self._scan, self._state, self._texture_region, wanted, quick=self._quick)
+
+    def _code_listed(self, wanted: TextureParameters) -> Coded | None:
+        """The same, but for blocks that are held well enough."""
+        self._count_encode()
+        parameters = replace(
+            texture_lattice(self._texture_region, wanted),
+            listed=listed_texture(self._state, self._texture_region, self._target_mse),
+        )
+        codec = CODECS[wanted.codec]
+        return code_texture_lattice(
+            self._scan, self._state, parameters, wanted.quality, codec, quick=self._quick
+        )
 
     def _count_encode(self) -> None:
         if self._superseded():

@@ -19,16 +19,19 @@ from node.library import Scan
 from node.refine_range import (
     PERCENTILE,
     client_range,
-    code_range,
     code_range_lattice,
     range_lattice,
 )
 from node.state import ClientState
 from protocol.grid import RANGE_BLOCK, VOID
+from protocol.holdings import COARSE_RANK
 from protocol.lattice import Channel, ChannelShape, mask_to_runs
 from protocol.messages import RangeParameters
 from protocol.reconstruct import cut
 from protocol.region import Region
+
+LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
+FEW_CELLS = 1  # too far off in a block that counts as good
 
 
 def mend_range(
@@ -36,11 +39,13 @@ def mend_range(
 ) -> Coded | None:
     """Encode a refinement after which the whole region is within target_steps, held blocks included.
 
-    Held blocks may have been good enough for the window they were sent for and be too poor for this one: where they
-    are, they are sent again, finer, and with a bitmap so that no other block is.
+    Blocks held well enough are left out by a bitmap. Others may have been good enough for the window they were sent for
+    and be too poor, all together, for this one: where they are, they are sent again, finer, and nothing else is.
     """
     held = state.holdings.channels[Channel.RANGE]
-    coded = code_range(scan, state, region, wanted)
+    good = _of_region((held.rank > COARSE_RANK) & (state.cells_beyond(target_steps) <= FEW_CELLS), region)
+    listed = mask_to_runs(~good) if good.mean() >= LISTED_SHARE else None
+    coded = code_range_lattice(scan, state, replace(range_lattice(region, wanted), listed=listed), wanted.quantum)
     kept = np.ones(held.shape.blocks, np.bool_)
     if coded is not None:
         kept.ravel()[coded.selection.adopted_blocks()] = False
@@ -52,9 +57,9 @@ def mend_range(
     quantum = min(wanted.quantum, 2 * int(target_steps) + 1, finer)
     if quantum < 1:
         return coded
-    listed = mask_to_runs((poor > 0) | ~_of_region(kept, region))
+    again = mask_to_runs((poor > 0) | ~_of_region(kept, region))
     exact = RangeParameters(p=1, quantum=quantum, s=None)  # at spacing 1 no cell is off by more than half a quantum
-    return code_range_lattice(scan, state, replace(range_lattice(region, exact), listed=listed), quantum)
+    return code_range_lattice(scan, state, replace(range_lattice(region, exact), listed=again), quantum)
 
 
 def _cells_inside(shape: ChannelShape, region: Region) -> NDArray[np.int64]:

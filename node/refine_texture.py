@@ -16,14 +16,15 @@ from node.state import ClientState
 from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
 from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
-from protocol.holdings import RANK_MARGIN, ChannelHoldings, texture_rank
-from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice
+from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
+from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice, mask_to_runs
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, select, texture_patch
 from protocol.region import Region
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 SPACINGS = (8, 4, 2, 1)
+LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -73,6 +74,15 @@ def code_texture_lattice(
         codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
     payload = encode_texture(texture_samples(scan, found[0]), codec, best, quick=quick)
     return Coded(*found, texture_rank(best), best, codec, payload)
+
+
+def listed_texture(state: ClientState, region: Region, target_mse: float) -> tuple[int, ...] | None:
+    """Runs over a region's blocks that list those not held well enough; None where nearly all are (F-07b)."""
+    held = state.holdings.channels[Channel.TEXTURE]
+    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
+    place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % held.shape.blocks[1])
+    good = (held.rank[place] > COARSE_RANK) & (state.missed[place] <= target_mse)
+    return mask_to_runs(~good) if good.mean() >= LISTED_SHARE else None
 
 
 def select_texture(

@@ -277,3 +277,17 @@ def test_texture_that_the_first_view_shows_well_enough_is_not_sent(
     assert update.texture_db == pytest.approx(viewer.texture_db(look), abs=0.3)
     assert viewer.texture_db(look) >= look.texture_db
     assert plan_update(scan, viewer.state, look, "htj2k").coded[-1].channel is Channel.TEXTURE  # not known yet: sent
+
+
+def test_a_window_a_little_further_on_costs_what_is_new_in_it(
+    scan: Scan, view: FirstView, model_of_texture: TextureModel
+) -> None:
+    viewer = Viewer(scan, view)
+    first = plan_update(scan, viewer.state, Look(1, 0.7, 0.5), "htj2k", model=model_of_texture)
+    viewer.take(first)
+    look = Look(1, 0.7 + 16 / 640, 0.5)
+    second = plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture)
+    viewer.take(second)
+    assert second.wire_bytes < 0.5 * first.wire_bytes
+    assert viewer.range_error_mm(look) <= look.range_mm
+    assert viewer.texture_db(look) >= look.texture_db - 0.01
