@@ -75,6 +75,11 @@ class Ledger:
         """The first columns still missing that the scanner may still hold, as many as one request carries."""
         return self._runs(lambda track: track.missing() & ~track.gone)
 
+    def first(self) -> tuple[ColumnRun, ...]:
+        """The first column of the sweep, for a request that shall bring nothing but the scanner's count."""
+        channel, pass_index = next(iter(self._tracks))
+        return (ColumnRun(channel, pass_index, 0, 1),)
+
     def left_behind(self) -> tuple[ColumnRun, ...]:
         """Columns the table has passed, that are missing and were not asked for in this way before."""
         runs = self._runs(lambda track: _behind(track) & track.missing() & ~track.gone & ~track.asked)

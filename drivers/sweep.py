@@ -41,7 +41,7 @@ class ScannerConfig:
 @dataclass(frozen=True, slots=True)
 class SweepReport:
     """What a sweep took: column pieces expected, received, received twice, belonging nowhere; columns asked for again;
-    bytes that could not be read; and its time."""
+    bytes that could not be read; its time; and the digest of what was received, as in SWEEP_END."""
 
     expected: int = 0
     received: int = 0
@@ -50,6 +50,7 @@ class SweepReport:
     requested_columns: int = 0
     dropped_bytes: int = 0
     elapsed_s: float = 0.0
+    digest: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +114,8 @@ class Collector:
         return is_new
 
     def ask(self) -> None:
-        """Ask for all that is missing, of a sweep that began before."""
-        self._request(self._ledger.missing())
+        """Ask for all that is missing, of a sweep that began before; where nothing is, for word that this is all."""
+        self._request(self._ledger.missing() or self._ledger.first())
 
     def take(self, event: Event) -> Iterator[SweepEvent]:
         """Anything but a column."""
@@ -206,4 +207,5 @@ class Collector:
             duplicates=ledger.duplicates,
             strays=ledger.strays,
             elapsed_s=self._now_s - self._began_s,
+            digest=ledger.digest,
         )

@@ -274,8 +274,8 @@ class Capture:
                     case SweepProgress(share):
                         running.flush()
                         self._status = replace(self._status, progress=share)
-                    case SweepFinished():
-                        running.finish(self._deliver)
+                    case SweepFinished(report):
+                        running.finish(self._deliver, report)
                         self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
                     case SweepInterrupted(cause=PortLost() as cause):
                         raise cause

@@ -4,9 +4,11 @@
 
 A journal is a row of records: magic, length, checksum, and as payload some messages, each behind its type and length.
 The messages are those of the scanner link, byte for byte; the first record has BEGIN (our own: format and time),
-HELLO_ACK and SWEEP_HEADER, the others have columns, the last one may have ERROR with the reason of an early end.
+HELLO_ACK and SWEEP_HEADER, the others have columns, the last one has SWEEP_END where the scanner's count agreed with
+ours, or ERROR with the reason of an early end.
 A record stands for itself: a torn tail costs that record, a rotten stretch in the middle costs what lies in it.
-A sweep is complete when it has every piece of every column that its header promises, whoever asks and whenever.
+A sweep is complete when it has every piece that its header promises and a SWEEP_END that agrees with them, whoever
+asks and whenever: pieces that nobody counted, or that were counted otherwise, do not become a scan by themselves.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ from protocol.scanner_messages import (
     DeviceInfo,
     Fault,
     Message,
+    Outcome,
     RangeColumn,
+    SweepEnd,
     SweepHeader,
     TextureColumn,
     decode_message,
@@ -63,6 +67,7 @@ class Interrupted:
 
     started_unix_s, ended_unix_s : by the node's clock.  info : the scanner that made it.  why : what ended it.
     held, expected : pieces of columns on disk, and those a complete sweep has.  damaged_bytes : rotten ones set aside.
+    is_complete : whether every column is there, as the scanner counted them: a scan can be made without the scanner.
     """
 
     id: str
@@ -75,11 +80,7 @@ class Interrupted:
     size_bytes: int
     damaged_bytes: int
     why: str
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether every column is there, so that a scan can be made without the scanner."""
-        return self.held == self.expected
+    is_complete: bool
 
 
 class Journal:
@@ -109,6 +110,10 @@ class Journal:
             self._writer.write(record)
         except OSError as error:
             raise disk_error("cannot keep the sweep", error) from error
+
+    def confirm(self, end: SweepEnd) -> None:
+        """Every piece is in, and they are what the scanner counted. end : its count, ours too."""
+        self._take(end)
 
     def close(self, why: str | None = None) -> None:
         """Make everything durable and let go of the file. why : what ended the sweep, unless it ended well."""
@@ -264,9 +269,9 @@ def needed_bytes(header: SweepHeader) -> int:
     total = 2 * spec.height * spec.width + 3 * spec.texture_height * spec.texture_width + RECORD_BYTES
     for channel, sample_bytes in ((Channel.RANGE, 2), (Channel.TEXTURE, 3)):
         if channel in header.channels:
-            columns, rows, piece_rows = header.shape(channel)
+            _, rows, piece_rows = header.shape(channel)
             column_bytes = rows * sample_bytes + -(-rows // piece_rows) * (_MESSAGE.size + COLUMN_OVERHEAD)
-            total += header.passes * columns * column_bytes
+            total += sum(header.columns_in(channel)) * column_bytes
     return total
 
 
@@ -309,17 +314,20 @@ def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
         raise LibraryError("its beginning is damaged")
     started_unix_s, info, header = _decode_opening(opening)
     ledger, read_bytes, why = Ledger(header), end, CUT_SHORT
+    counted: SweepEnd | None = None
     for place, payload in records:
         end, read_bytes = place, read_bytes + _RECORD.size + len(payload)
         for message in _messages_in(payload):
             if isinstance(message, Fault):
                 why = message.text
+            elif isinstance(message, SweepEnd):
+                counted = message
             elif isinstance(message, RangeColumn | TextureColumn):
                 ledger.take(message)
-    if ledger.held == ledger.expected:
-        why = COMPLETE
+    is_complete = counted == SweepEnd(header.sweep, Outcome.COMPLETE, ledger.expected, ledger.digest)
     counts = ledger.held, ledger.expected, end, end - read_bytes
-    return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, why)
+    said = COMPLETE if is_complete else why
+    return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, said, is_complete)
 
 
 def _record_at(data: bytes | mmap.mmap, at: int) -> memoryview | None:

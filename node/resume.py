@@ -106,12 +106,16 @@ def _swept_again(
     scanner: Scanner, header: SweepHeader, ledger: Ledger, stop: threading.Event
 ) -> Iterator[SweepEvent]:
     """Home the table and sweep once more, for the pieces that the ledger lacks."""
+    if ledger.held == ledger.expected:
+        yield _refusal("every column is there, and the scanner does not confirm them: sweep anew")
+        return
     calibration = scanner.calibrate().calibration
     if calibration != header.calibration:
         yield _refusal("the scanner was calibrated anew since")
         return
     s = header.spec
-    request = SweepRequest(header.channels, header.passes, s.width, s.height, s.texture_width, s.texture_height)
+    shape = s.width, s.height, s.texture_width, s.texture_height
+    request = SweepRequest(header.channels, header.passes, *shape, overlap=header.overlap)
     with closing(scanner.sweep(request, stop)) as events:
         again = header
         for event in events:
@@ -125,7 +129,7 @@ def _swept_again(
                 if ledger.take(column):
                     yield column
                 if ledger.held == ledger.expected:
-                    yield SweepFinished(SweepReport(expected=ledger.expected, received=ledger.held))
+                    yield SweepFinished(SweepReport(ledger.expected, ledger.held, digest=ledger.digest))
                     return
             else:
                 yield event

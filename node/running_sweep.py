@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
+from drivers.scanner import SweepReport
 from node.assemble import Assembler
 from node.journal import Journal, Journals
 from node.resume import add_column, encoder_of
 from protocol.errors import RemoteWireError, ScannerFault
 from protocol.grid import Grid
-from protocol.scanner_messages import Column, DeviceInfo, SweepHeader
+from protocol.scanner_messages import Column, DeviceInfo, Outcome, SweepEnd, SweepHeader
 
 
 class RunningSweep:
@@ -28,6 +29,7 @@ class RunningSweep:
         self._info = info
         self._sweep_id = sweep_id
         self._journal: Journal | None = None
+        self._sweep = 0
         self._assembler: Assembler | None = None
 
     def begin(self, header: SweepHeader) -> None:
@@ -36,6 +38,7 @@ class RunningSweep:
             self._assembler = Assembler(header.spec, encoder_of(header))
         except ValueError as error:
             raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
+        self._sweep = header.sweep
         if self._sweeps is not None and self._sweep_id is not None:
             self._journal = self._sweeps.reopen(self._sweep_id)
         elif self._sweeps is not None:
@@ -54,12 +57,13 @@ class RunningSweep:
         if self._journal is not None:
             self._journal.flush()
 
-    def finish(self, deliver: Callable[[Grid], None]) -> None:
+    def finish(self, deliver: Callable[[Grid], None], report: SweepReport) -> None:
         """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
         assert self._assembler is not None
         self.flush()
         grid = self._assembler.finish()
         if self._journal is not None:
+            self._journal.confirm(SweepEnd(self._sweep, Outcome.COMPLETE, report.received, report.digest))
             self._journal.close()
         deliver(grid)
         if self._journal is not None and self._sweeps is not None:

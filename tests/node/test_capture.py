@@ -11,18 +11,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.scanner import Scanner, ScannerConfig, SweepEvent, SweepInterrupted, SweepProgress, SweepStarted
+from drivers.scanner import (
+    Scanner,
+    ScannerConfig,
+    SweepEvent,
+    SweepInterrupted,
+    SweepProgress,
+    SweepReport,
+    SweepStarted,
+)
 from drivers.serial_port import SerialPort
 from node import durable
 from node.capture import Capture, CaptureStatus
 from node.journal import Journals
 from node.resume import publish_complete
+from node.running_sweep import RunningSweep
 from protocol.errors import LibraryError, PortLost
 from protocol.grid import Grid, GridSpec
 from protocol.scanner_messages import RangeColumn, TextureColumn
 from simulators.carriers import PtyPort, serve
 from simulators.scanner import SimulatedScanner
 from simulators.specimen import Specimen
+from simulators.sweep import Sweep
 from simulators.turntable import Turntable
 
 SPEC = GridSpec(width=48, height=30, texture_width=64, texture_height=40, step_mm=0.05, pitch_mm=1.0, theta0_rad=0.3)
@@ -344,6 +354,43 @@ def test_a_grid_that_is_not_taken_stays_and_is_published_later(plug: Plug, node:
     assert is_truth(node.grids.get(timeout=WAIT_S))
     node.wait_until("ready")
     assert node.sweeps.interrupted() == []
+
+
+def test_columns_that_the_scanner_counted_otherwise_never_become_a_scan(
+    plug: Plug, node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end = Sweep.end
+    monkeypatch.setattr(Sweep, "end", lambda sweep: replace(end(sweep), digest=1))
+    plug.plug(device())
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    assert "not those the scanner counted" in node.wait_for(SweepInterrupted).reason
+    node.wait_until("ready", "counted")
+    (sweep,) = node.sweeps.interrupted()
+    assert sweep.held == sweep.expected and not sweep.is_complete and "counted" in sweep.why
+    assert node.capture.request_resume(sweep.id)
+    node.wait_until("ready", "does not confirm them")
+    node.capture.stop()
+    again = Journals(tmp_path / "sweeps")
+    assert publish_complete(again, node.deliver) == [] and node.grids.empty()
+    assert [kept.id for kept in again.interrupted()] == [sweep.id]
+
+
+def test_a_whole_sweep_whose_count_had_not_come_is_counted_when_it_goes_on(
+    plug: Plug, node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = RunningSweep.finish
+
+    def cut(running: RunningSweep, deliver: Callable[[Grid], None], report: SweepReport) -> None:
+        monkeypatch.setattr(RunningSweep, "finish", finish)
+        raise PortLost("tty: unplugged")
+
+    monkeypatch.setattr(RunningSweep, "finish", cut)
+    plug.plug(device())
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    assert node.wait_for(SweepInterrupted).reason == "tty: unplugged"
+    assert is_truth(node.grids.get(timeout=WAIT_S))
 
 
 def test_a_full_disk_refuses_a_sweep_before_it_starts(

@@ -2,6 +2,7 @@ import errno
 import os
 import zlib
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 
@@ -24,7 +25,16 @@ from node.journal import (
 )
 from protocol.errors import LibraryError
 from protocol.grid import GridSpec
-from protocol.scanner_messages import Channel, Column, DeviceInfo, RangeColumn, SweepHeader, TextureColumn
+from protocol.scanner_messages import (
+    Channel,
+    Column,
+    DeviceInfo,
+    Outcome,
+    RangeColumn,
+    SweepEnd,
+    SweepHeader,
+    TextureColumn,
+)
 
 SPEC = GridSpec(width=16, height=10, texture_width=32, texture_height=12, step_mm=0.05, pitch_mm=1.0)
 HEADER = SweepHeader(7, SPEC, 3200, range_rows=6, texture_rows=12, calibration=99)
@@ -59,13 +69,21 @@ def kept(folder: Path, pieces: Iterable[Column], why: str = "unplugged") -> str:
     return journals.keep(journal, why).id
 
 
-def crashed(folder: Path, pieces: Iterable[Column]) -> Path:
-    """The file of a sweep whose node went away without a word after some pieces."""
+def count(pieces: Iterable[Column]) -> SweepEnd:
+    """What a scanner says that has sent these pieces."""
+    digests = [zlib.crc32(piece.to_bytes()) for piece in pieces]
+    return SweepEnd(HEADER.sweep, Outcome.COMPLETE, len(digests), sum(digests) % 2**32)
+
+
+def crashed(folder: Path, pieces: Iterable[Column], end: SweepEnd | None = None) -> Path:
+    """The file of a sweep whose node went away without a word after some pieces. end : with which they agreed."""
     journals = Journals(folder)
     journal = journals.begin(INFO, HEADER, 1e9)
     for piece in pieces:
         journal.add(piece)
         journal.flush()
+    if end is not None:
+        journal.confirm(end)
     journal.close()
     return folder / f"{journal.id}.sweep"
 
@@ -93,10 +111,34 @@ def test_a_sweep_that_runs_is_not_among_the_interrupted(tmp_path: Path) -> None:
     resumed.close()
 
 
-def test_a_sweep_with_every_piece_is_complete_whoever_cut_it(tmp_path: Path) -> None:
-    crashed(tmp_path, columns())
+def test_a_sweep_with_every_piece_that_was_counted_is_complete_whoever_cut_it(tmp_path: Path) -> None:
+    crashed(tmp_path, columns(), count(columns()))
     (sweep,) = Journals(tmp_path).interrupted()
     assert sweep.is_complete and sweep.why == COMPLETE
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        None,
+        replace(count(columns()), digest=0),
+        replace(count(columns()), pieces=PIECES - 1),
+        replace(count(columns()), sweep=8),
+        replace(count(columns()), outcome=Outcome.FAULT),
+    ],
+)
+def test_a_sweep_with_every_piece_that_nobody_counted_so_is_not_complete(
+    tmp_path: Path, end: SweepEnd | None
+) -> None:
+    crashed(tmp_path, columns(), end)
+    (sweep,) = Journals(tmp_path).interrupted()
+    assert (sweep.held, sweep.is_complete, sweep.why) == (PIECES, False, CUT_SHORT)
+
+
+def test_pieces_that_are_lost_from_a_counted_sweep_make_it_incomplete(tmp_path: Path) -> None:
+    crashed(tmp_path, columns()[1:], count(columns()))
+    (sweep,) = Journals(tmp_path).interrupted()
+    assert not sweep.is_complete
 
 
 def test_a_sweep_goes_on_in_the_same_journal(tmp_path: Path) -> None:
@@ -106,6 +148,7 @@ def test_a_sweep_goes_on_in_the_same_journal(tmp_path: Path) -> None:
     journal = journals.reopen(sweep_id)
     for piece in pieces[10:]:  # some come twice
         journal.add(piece)
+    journal.confirm(count(pieces))
     journal.close()
     (sweep,) = Journals(tmp_path).interrupted()
     assert sweep.is_complete
@@ -248,7 +291,8 @@ def test_what_a_sweep_needs_is_its_journal_and_its_scan(tmp_path: Path) -> None:
     assert path.stat().st_size + scan_bytes <= needed_bytes(HEADER) <= path.stat().st_size + scan_bytes + 65536
     twice = SweepHeader(7, SPEC, 3200, range_rows=6, texture_rows=12, passes=2)
     one = SweepHeader(7, SPEC, 3200, range_rows=6, texture_rows=12, channels=Channel.RANGE)
-    assert needed_bytes(one) < needed_bytes(HEADER) < needed_bytes(twice)
+    beyond = replace(HEADER, overlap=128)
+    assert needed_bytes(one) < needed_bytes(HEADER) < needed_bytes(beyond) < needed_bytes(twice)
 
 
 def test_a_disk_that_fills_up_ends_the_sweep_and_keeps_what_fits(
