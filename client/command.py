@@ -1,4 +1,4 @@
-"""The subcommands `discover`, `scan`, `export`, `import` and `look`: a headless client."""
+"""The subcommands `discover`, `scan`, `scans`, `export`, `import` and `look`: a headless client."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from client import exchange_command, scan_command
+from client import exchange_command, scan_command, scans_command
 from client.arguments import add_node, add_search, between, byte_count, no_node, node_url, number, share
 from protocol.printable import printable
 
@@ -21,18 +21,19 @@ CENTRE = (0.5, 0.5)
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Offer `discover`, `scan`, `export`, `import` and `look`."""
+    """Offer `discover`, `scan`, `scans`, `export`, `import` and `look`."""
     finder = subparsers.add_parser("discover", help="list the nodes on this network")
     add_search(finder)
     finder.add_argument("--name", help="stop at the node of this name or id")
     finder.set_defaults(run=run_discover)
 
     scan_command.add_subcommands(subparsers)
+    scans_command.add_subcommands(subparsers)
     exchange_command.add_subcommands(subparsers)
 
     looker = subparsers.add_parser("look", help="open a scan and get detail where you look")
     add_node(looker)
-    looker.add_argument("--scan", default="latest", metavar="ID", help="which scan (latest)")
+    looker.add_argument("--scan", default="latest", metavar="ID", help="which scan: its id, or six digits (latest)")
     looker.add_argument(
         "--at", type=_click, nargs="+", action="extend", metavar="U,V", help="where to look, each in [0, 1) (0.5,0.5)"
     )

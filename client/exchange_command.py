@@ -22,7 +22,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     """Offer `export` and `import`."""
     export = subparsers.add_parser("export", help="write a node's scan to a file: .glb, .ply, .obj.zip, .stl or .npz")
     export.add_argument("file", type=Path, help="what to write; the suffix is the format")
-    export.add_argument("--scan", default="latest", metavar="ID", help="which scan (latest)")
+    export.add_argument("--scan", default="latest", metavar="ID", help="which scan: its id, or six digits (latest)")
     add_node(export)
     export.set_defaults(run=run_export)
 

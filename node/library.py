@@ -46,6 +46,7 @@ __all__ = ["About", "Library", "Problem", "Scan", "ScanSummary", "content_id", "
 
 OPEN_MAX = 4
 LATEST = "latest"  # stands for the id of the newest scan
+PREFIX_MIN = 6  # as few digits of an id stand for it
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,13 +132,21 @@ class Library:
         return summary
 
     def resolve(self, scan_id: str) -> str:
-        """The id that "latest" stands for; any other is returned as it is. Raises LibraryError when there is none."""
-        if scan_id != LATEST:
+        """The id that "latest" stands for, or the beginning of just one id; any other is returned as it is.
+
+        Raises LibraryError when there is no scan, or several begin so.
+        """
+        if scan_id == LATEST:
+            scans = self.scans()
+            if not scans:
+                raise LibraryError("there is no scan yet: start a sweep")
+            return scans[0].id
+        if scan_id in self._known or len(scan_id) < PREFIX_MIN:
             return scan_id
-        scans = self.scans()
-        if not scans:
-            raise LibraryError("there is no scan yet: start a sweep")
-        return scans[0].id
+        found = [known for known in self._known if known.startswith(scan_id)]
+        if len(found) > 1:
+            raise LibraryError(f"{len(found)} scans begin with {scan_id!r}: give more of the id")
+        return found[0] if found else scan_id
 
     def open(self, scan_id: str) -> Scan:
         """A scan with its samples mapped and checked against its id. Raises LibraryError when unknown or damaged."""

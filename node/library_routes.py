@@ -9,8 +9,8 @@
     GET    /v1/sweeps/{sweep}.npz       what there is of it (node.partial)
     DELETE /v1/sweeps/{sweep}
 
-A scan is named by its id. What only reads takes "latest" too; what changes or deletes a scan does not, since another
-one may be the newest by the time that it is done.
+A scan is named by its id. What only reads takes "latest" and the beginning of an id too; what changes or deletes a scan
+does not, since they may stand for another one by the time that it is done.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from node.auth import ROLE, require
 from node.capture import Capture, CaptureStatus
 from node.durable import NoRoom
 from node.journal import Interrupted
-from node.library import LATEST, Library, verify
+from node.library import Library, verify
 from node.partial import write_partial
 from node.sidecar import Conflict, Sidecar, decode_changes
 from protocol.errors import LibraryError
@@ -103,10 +103,11 @@ class LibraryRoutes:
         return web.Response(status=204)
 
     def _named(self, request: web.Request) -> str:
-        """The scan that is to be changed. Raises 400 for "latest", 404."""
-        if request.match_info["scan"] == LATEST:
-            raise web.HTTPBadRequest(text="name the scan to change by its id: another may be the latest by now")
-        return self._known(request)
+        """The scan that is to be changed. Raises 400 unless it is named by its whole id, 404."""
+        scan_id = self._known(request)
+        if request.match_info["scan"] != scan_id:
+            raise web.HTTPBadRequest(text="name the scan to change by its whole id: it may not be this one by now")
+        return scan_id
 
     def _known(self, request: web.Request) -> str:
         """The scan that is asked for. Raises 404."""

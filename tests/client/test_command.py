@@ -19,7 +19,7 @@ from client.session import _checked_look
 from client.update import Tally
 from exchange.errors import ExchangeError
 from protocol import messages as m
-from protocol.errors import LocalWireError, ScannerFault
+from protocol.errors import LocalWireError, RemoteWireError, ScannerFault
 from tests.client.scripted_node import Line, greet, serving_in_thread, show_and_answer, synthetic_grid
 
 GRID = synthetic_grid()
@@ -234,7 +234,9 @@ def test_a_node_without_a_scanner_is_named() -> None:
         run("scan", "--node", url)
 
 
-@pytest.mark.parametrize("command", [("discover",), ("look",), ("scan",), ("export", "x.glb"), ("import", "x.npz")])
+@pytest.mark.parametrize(
+    "command", [("discover",), ("look",), ("scan",), ("scans",), ("export", "x.glb"), ("import", "x.npz")]
+)
 @pytest.mark.parametrize("timeout", ["0", "-1", "nan", "inf", "3601", "soon"])
 def test_every_command_checks_how_long_to_search(
     command: tuple[str, ...], timeout: str, capsys: pytest.CaptureFixture[str]
@@ -242,6 +244,42 @@ def test_every_command_checks_how_long_to_search(
     with pytest.raises(SystemExit) as end:
         run(*command, "--timeout", timeout)
     assert end.value.code == 2 and "--timeout: expected" in capsys.readouterr().err
+
+
+def listing(scans: Any) -> web.RouteDef:
+    async def answer(request: web.Request) -> web.Response:
+        return web.json_response(scans)
+
+    return web.get("/v1/scans", answer)
+
+
+SCAN = {
+    "id": "65c920f10da19d5aa6d707ea911682d3", "created": 0, "source": "sweep", "name": "red \x1b[31m",
+    "width": 360, "height": 100, "textureWidth": 1024, "textureHeight": 256,
+}  # fmt: skip
+
+
+def test_scans_lists_whole_ids(capsys: pytest.CaptureFixture[str]) -> None:
+    scans = [SCAN, {**SCAN, "created": 1e300, "name": ""}]
+    with serving_in_thread(greet_and_wait, listing(scans)) as url:
+        assert run("scans", "--node", url) == 0
+        first, second = capsys.readouterr().out.splitlines()
+        assert run("scans", "--node", url, "--json") == 0
+    assert first.startswith(f"{SCAN['id']}  19") and first.endswith(r"360 x 100 + 1024 x 256  red \x1b[31m")
+    assert second.endswith("at no known time  360 x 100 + 1024 x 256")
+    assert json_lines(capsys.readouterr().out) == scans
+
+
+def test_a_node_without_scans_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    with serving_in_thread(greet_and_wait, listing([])) as url:
+        assert run("scans", "--node", url) == 0
+    assert capsys.readouterr().out == "no scans\n"
+
+
+@pytest.mark.parametrize("said", [{}, [1], [{**SCAN, "id": 5}], [{"id": "x"}]])
+def test_what_is_no_list_of_scans_is_refused(said: Any) -> None:
+    with serving_in_thread(greet_and_wait, listing(said)) as url, pytest.raises(RemoteWireError, match="scans"):
+        run("scans", "--node", url)
 
 
 async def greet_and_wait(line: Line) -> None:

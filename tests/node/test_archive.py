@@ -197,7 +197,7 @@ def test_a_file_of_another_kind_is_no_backup(tmp_path: Path, data: bytes) -> Non
     (tmp_path / "notes.txt").write_bytes(data)
     (tmp_path / "library").mkdir()
     with pytest.raises(LibraryError, match="^not a backup of a library: it does not begin as one$"):
-        restore(tmp_path / "notes.txt", tmp_path / "library")
+        archive.restore(tmp_path / "notes.txt", tmp_path / "library")
     assert list((tmp_path / "library").iterdir()) == []
 
 

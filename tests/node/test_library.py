@@ -42,6 +42,22 @@ def _files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def test_six_digits_and_more_that_one_id_begins_with_stand_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = Library(tmp_path)
+    scan_id = library.add(_grid(0), ABOUT).id
+    for digits in (6, 12, 31, 32):
+        assert library.resolve(scan_id[:digits]) == scan_id
+    for other in (scan_id[:5], "0" * 6, scan_id + "0"):
+        assert library.resolve(other) == other
+    twin = scan_id[:8] + "0" * 24
+    monkeypatch.setattr(library, "_known", {**library._known, twin: library.summary(scan_id)})
+    with pytest.raises(LibraryError, match=f"2 scans begin with '{scan_id[:6]}': give more of the id"):
+        library.resolve(scan_id[:6])
+    assert library.resolve(scan_id) == scan_id
+
+
 def test_a_kept_scan_is_the_same_after_a_restart(tmp_path: Path) -> None:
     grid = _grid(0)
     added = Library(tmp_path / "new" / "library").add(grid, ABOUT)

@@ -122,14 +122,17 @@ async def test_a_scan_is_verified(bench: Bench, client: Client) -> None:
     assert not said["sound"] and "not what they were" in said["reason"]
 
 
-async def test_the_latest_scan_is_read_by_that_name_but_not_changed(bench: Bench, client: Client) -> None:
-    assert (await client.get("/v1/scans/latest/sidecar")).status == 200
-    assert (await (await client.post("/v1/scans/latest/verify")).json())["id"] == bench.scan
-    for refused in (
-        await client.patch("/v1/scans/latest/sidecar", json={"name": "x"}),
-        await client.delete("/v1/scans/latest"),
-    ):
-        assert (refused.status, "by its id" in await refused.text()) == (400, True)
+async def test_the_latest_scan_or_part_of_an_id_is_read_by_that_name_but_not_changed(
+    bench: Bench, client: Client
+) -> None:
+    for name in ("latest", bench.scan[:6]):
+        assert (await client.get(f"/v1/scans/{name}/sidecar")).status == 200
+        assert (await (await client.post(f"/v1/scans/{name}/verify")).json())["id"] == bench.scan
+        for refused in (
+            await client.patch(f"/v1/scans/{name}/sidecar", json={"name": "x"}),
+            await client.delete(f"/v1/scans/{name}"),
+        ):
+            assert (refused.status, "by its whole id" in await refused.text()) == (400, True)
     assert bench.library.sidecar(bench.scan).revision == 0
     bench.library.delete(bench.scan)
     assert (await client.get("/v1/scans/latest/sidecar")).status == 404
