@@ -9,11 +9,8 @@ sender that stalls for STALL_S loses its place.
 from __future__ import annotations
 
 import asyncio
-import errno
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import BinaryIO
 
 import msgspec
@@ -25,14 +22,13 @@ from exchange.native import read_native
 from node.auth import require
 from node.exhibits import Exhibits
 from node.library import About, Scan
+from node.spool import CHUNK_BYTES, STALL_S, disk_trouble, send, spool
 from protocol.errors import LibraryError
 from protocol.grid import Grid
 
-CHUNK_BYTES = 1 << 18
 IMPORT_BYTES_MAX = 1 << 29
 ARRAY_BYTES_MAX = 1 << 28
 EXPORTS_MAX = 2
-STALL_S = 60.0
 FORMATS = "|".join(suffix.removeprefix(".").replace(".", r"\.") for suffix in MEDIA_TYPES)
 
 
@@ -58,15 +54,15 @@ class ExchangeRoutes:
             scan_id = self._exhibits.library.resolve(request.match_info["scan"])
             suffix = f".{request.match_info['format']}"
             scan = await asyncio.to_thread(self._exhibits.library.open, scan_id)
-            with self._temporary() as file:
+            with spool(self._exhibits.library.folder) as file:
                 await asyncio.to_thread(_write, scan, suffix, file)
-                return await _send(request, file, f"{scan_id}{suffix}", MEDIA_TYPES[suffix])
+                return await send(request, file, f"{scan_id}{suffix}", MEDIA_TYPES[suffix])
 
     async def _import(self, request: web.Request) -> web.Response:
         require(request, "operate")
         _check_free(self._importing)
         async with self._importing:
-            with self._temporary() as file:
+            with spool(self._exhibits.library.folder) as file:
                 await _receive(request, file)
                 name, grid = await asyncio.to_thread(_read, file)
             scan = await self._keep(name, grid)
@@ -79,17 +75,6 @@ class ExchangeRoutes:
             return await asyncio.to_thread(self._exhibits.library.add, grid, about)
         except LibraryError as problem:
             raise web.HTTPInsufficientStorage(text=str(problem)) from problem
-
-    @contextmanager
-    def _temporary(self) -> Iterator[BinaryIO]:
-        """A nameless file on the library's disk. Raises an HTTP error where that is full, which may show at the end."""
-        try:
-            with tempfile.TemporaryFile(dir=self._exhibits.library.folder) as file:
-                yield file
-        except (ConnectionError, TimeoutError):
-            raise
-        except OSError as problem:
-            raise _disk_trouble(problem) from problem
 
 
 def _check_free(places: asyncio.Semaphore) -> None:
@@ -104,20 +89,7 @@ def _write(scan: Scan, suffix: str, file: BinaryIO) -> None:
     except ExchangeError as problem:
         raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
     except OSError as problem:
-        raise _disk_trouble(problem) from problem
-
-
-async def _send(request: web.Request, file: BinaryIO, name: str, media_type: str) -> web.StreamResponse:
-    response = web.StreamResponse(headers={"Content-Disposition": f'attachment; filename="{name}"'})
-    response.content_type = media_type
-    response.content_length = file.tell()
-    await response.prepare(request)
-    file.seek(0)
-    while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
-        async with asyncio.timeout(STALL_S):
-            await response.write(chunk)
-    await response.write_eof()
-    return response
+        raise disk_trouble(problem) from problem
 
 
 async def _receive(request: web.Request, file: BinaryIO) -> None:
@@ -138,7 +110,7 @@ async def _receive(request: web.Request, file: BinaryIO) -> None:
     except (ClientError, web.RequestPayloadError) as problem:
         raise web.HTTPBadRequest(text=f"the upload ended early: {problem}") from problem
     except OSError as problem:
-        raise _disk_trouble(problem) from problem
+        raise disk_trouble(problem) from problem
 
 
 def _check_length(size_bytes: int) -> None:
@@ -152,11 +124,3 @@ def _read(file: BinaryIO) -> tuple[str, Grid]:
         return read_native(file, array_bytes_max=ARRAY_BYTES_MAX)
     except ExchangeError as problem:
         raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
-
-
-def _disk_trouble(problem: OSError) -> web.HTTPException:
-    if isinstance(problem, ConnectionError):
-        return web.HTTPBadRequest(text="the connection was lost")
-    if problem.errno == errno.ENOSPC:
-        return web.HTTPInsufficientStorage(text="the node's disk is full")
-    return web.HTTPInternalServerError(text=f"the node's disk: {problem.strerror}")

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
@@ -32,9 +31,8 @@ from node.journal import Interrupted
 from node.library import Library, verify
 from node.partial import write_partial
 from node.sidecar import Conflict, Sidecar, decode_changes
+from node.spool import send, spool
 from protocol.errors import LibraryError
-
-CHUNK_BYTES = 1 << 18
 
 
 def who_asks(request: web.Request) -> str:
@@ -138,23 +136,14 @@ class LibraryRoutes:
 
     async def _export_sweep(self, request: web.Request) -> web.StreamResponse:
         sweep = self._interrupted(request)
-        with tempfile.TemporaryFile(dir=self._library.folder) as file:  # nameless: a crash leaves nothing
+        with spool(self._library.folder) as file:
             with _explained():
                 await asyncio.to_thread(self._write, sweep, file)
-            size_bytes = file.tell()
-            file.seek(0)
-            response = web.StreamResponse()
-            response.content_type = "application/octet-stream"
-            response.content_length = size_bytes
-            response.headers["Content-Disposition"] = f'attachment; filename="interrupted-{sweep.id}.npz"'
-            await response.prepare(request)
-            while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
-                await response.write(chunk)
-            await response.write_eof()
-            return response
+            return await send(request, file, f"interrupted-{sweep.id}.npz", "application/octet-stream")
 
     def _write(self, sweep: Interrupted, file: BinaryIO) -> None:
         write_partial(sweep, self._library.sweeps.columns(sweep.id), file)
+        file.flush()
 
     def _interrupted(self, request: web.Request) -> Interrupted:
         """The sweep that is asked for. Raises 404."""

@@ -1,4 +1,5 @@
 import io
+import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -172,6 +173,16 @@ async def test_an_interrupted_sweep_is_exported_as_what_it_is(bench: Bench, clie
     assert set(bench.library.folder.iterdir()) == {
         bench.library.folder / name for name in (bench.scan, "library.json", "lock", "sweeps")
     }
+
+
+async def test_a_sweep_that_the_disk_has_no_room_to_export_is_507(
+    bench: Bench, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "TemporaryFile", lambda dir: open("/dev/full", "r+b"))
+        answer = await client.get(f"/v1/sweeps/{bench.sweep}.npz")
+        assert (answer.status, await answer.text()) == (507, "the node's disk is full")
+    assert (await client.get(f"/v1/sweeps/{bench.sweep}.npz")).status == 200
 
 
 async def test_a_full_disk_is_told_as_such(bench: Bench, client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
