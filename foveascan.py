@@ -30,10 +30,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 
 import client.command
@@ -216,12 +217,17 @@ def _serve(scanner: str, library: str) -> list[str]:
 
 
 @contextmanager
-def started(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any]]]:
+def started(
+    *arguments: str, environment: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any]]]:
     """Another subcommand (given --json) as a process, with the line that says it is ready; ended with the block.
 
+    environment : what its environment has beside ours.
     Raises FoveascanError when it ends, or says anything else, before it is ready.
     """
-    with subprocess.Popen([*PROGRAM, *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as program:
+    all_of_it = {**os.environ, **environment}
+    command = [*PROGRAM, *arguments]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, env=all_of_it) as program:
         try:
             yield program, _ready_line(program, arguments[0])
         finally:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from node.library_command import add_library_command
 
+ADDRESS = "the scanner's: path of a serial port, serial:VID:PID[:SERIAL] or usb:VID:PID[:SERIAL]"
+
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `serve` and `doctor`."""
@@ -16,7 +18,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     serve.add_argument("--library", metavar="DIR", help="folder the scans are kept in")
     serve.add_argument("--listen", metavar="HOST:PORT", help="address to serve (127.0.0.1:7345); port 0: any free one")
     serve.add_argument("--insecure", action="store_true", default=None, help="plain HTTP without login, loopback only")
-    serve.add_argument("--scanner", metavar="PATH", help="serial port of the scanner; none: library only")
+    serve.add_argument("--scanner", metavar="ADDRESS", help=f"{ADDRESS}; none: library only")
     serve.add_argument("--baud", type=_baud, help="its speed in baud, 9600..12000000 (3000000)")
     serve.add_argument("--name", help="name to announce on the network (this host's)")
     serve.add_argument("--json", action="store_true", help="print one JSON object once the node is ready")
@@ -24,8 +26,13 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
 
     doctor = subparsers.add_parser("doctor", help="say what keeps a node from working here, and the cure")
     doctor.add_argument("--config", type=Path, metavar="FILE", help="settings the node runs with (TOML)")
-    doctor.add_argument("--scanner", metavar="PATH", help="serial port of the scanner, instead of the one set there")
+    doctor.add_argument("--scanner", metavar="ADDRESS", help="the scanner's, instead of the one set there")
     doctor.add_argument("--library", metavar="DIR", help="folder the scans are kept in, instead of the one set there")
+    doctor.add_argument(
+        "--link",
+        metavar="ADDRESS",
+        help="check a scanner's firmware instead, by sweeping with it several times: with nothing on the table",
+    )
     doctor.add_argument("--json", action="store_true", help="print one JSON object a check")
     doctor.set_defaults(run=run_doctor)
 
@@ -72,10 +79,17 @@ def run_doctor(args: argparse.Namespace) -> int:
     import json
     from dataclasses import asdict
 
-    from node.doctor import examine
+    from node.doctor import examine, examine_scanner
 
+    overrides = {"capture.scanner": args.scanner, "library.folder": args.library}
+    if args.link is None:
+        findings = examine(args.config, overrides)
+    else:
+        if not args.json:
+            print("This sweeps with the scanner, several times.", flush=True)
+        findings = examine_scanner(args.link, args.config, overrides)
     has_problem = False
-    for finding in examine(args.config, {"capture.scanner": args.scanner, "library.folder": args.library}):
+    for finding in findings:
         has_problem |= finding.state == "problem"
         if args.json:
             print(json.dumps(asdict(finding)), flush=True)

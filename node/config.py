@@ -41,7 +41,7 @@ def is_loopback(host: str) -> bool:
 class Capture(Struct, frozen=True, forbid_unknown_fields=True):
     """[capture]: the scanner's port."""
 
-    scanner: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # device path; none: library only
+    scanner: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # address; none: library only
     baud: Annotated[int, Meta(ge=9600, le=12_000_000)] = 3_000_000  # [Bd]; a USB CDC device ignores it
     stale_s: Annotated[float, Meta(ge=0.1, le=60)] = 2.0  # a link quiet for so long is stale
 

@@ -14,9 +14,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from drivers.port import Port
-from drivers.scanner import ScannerConfig
-from drivers.serial_port import SerialPort
+from drivers.discover import config_for, open_port
 from node.advertise import Advertisement
 from node.capture import Capture
 from node.config import Config
@@ -87,12 +85,9 @@ def _keep(library: Library, grid: Grid) -> Scan:
 def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | None, list[Callable[[str], object]]]:
     """The capture thread's owner, and the list of who is told of each new scan."""
     announce: list[Callable[[str], object]] = []
-    path = config.capture.scanner
-    if path is None:
+    address = config.capture.scanner
+    if address is None:
         return None, announce
-
-    def open_port() -> Port:
-        return SerialPort(path, config.capture.baud)
 
     def deliver(grid: Grid) -> None:
         scan = _keep(library, grid)
@@ -101,8 +96,9 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
         for tell in announce:
             tell(scan.id)
 
-    link = ScannerConfig(quiet_s=config.capture.stale_s)
-    return Capture(open_port, link, deliver, live.watch, library.sweeps), announce
+    opened = partial(open_port, address, config.capture.baud)
+    link = config_for(address, config.capture.stale_s)
+    return Capture(opened, link, deliver, live.watch, library.sweeps), announce
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:

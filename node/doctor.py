@@ -22,6 +22,8 @@ from typing import Literal
 
 import msgspec
 
+from drivers.conformance import examine_link
+from drivers.discover import config_for, find_ports, open_port
 from node import config as settings
 from node.advertise import HEARD_S, is_heard
 from node.durable import EASY_BYTES
@@ -41,7 +43,7 @@ from node.machine import (
     written_last_s,
 )
 from node.scan_folder import name_problems
-from protocol.errors import ConfigError, LibraryError
+from protocol.errors import ConfigError, LibraryError, PortLost
 from protocol.printable import counted
 
 RULE = "70-foveascan.rules"
@@ -51,6 +53,8 @@ DISK_MIN_BYTES = 2 * SWEEP_L_BYTES  # a journal and the scan it becomes
 MEMORY_BASE_BYTES, MEMORY_FACTOR = 150 << 20, 6  # issue 3: 6x the arrays of a scan, and this
 ANSWER_S = 2.0
 ANSWER_BYTES_MAX = 65536
+
+LOOKED_UP = ("usb:", "serial:")  # addresses that are no paths
 
 State = Literal["ok", "warning", "problem"]
 
@@ -86,21 +90,56 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     yield check_library(library)
 
 
+def examine_scanner(address: str, path: Path | None, overrides: Mapping[str, object]) -> Iterator[Finding]:
+    """Every check of a scanner's firmware; it sweeps, several times. path, overrides : as for load_config.
+
+    Raises ConfigError.
+    """
+    capture = settings.load_config(path, overrides).capture
+    try:
+        port = open_port(address, capture.baud)
+    except PortLost as error:
+        yield _no_port(str(error))
+        return
+    try:
+        for finding in examine_link(port, config_for(address, capture.stale_s)):
+            yield Finding(finding.check, finding.state, finding.found, finding.cure)
+    finally:
+        port.close()
+
+
 def check_port(port: str | None, *, is_used: bool = False) -> Finding:
     """Whether the scanner's port is there and can be opened. is_used : a node has it open now."""
     if port is None:
         return Finding("port", "ok", "none is set: a library without a scanner", "set capture.scanner, to sweep")
+    if port.startswith(LOOKED_UP):
+        return _looked_up(port, is_used)
     try:
         info = os.stat(port)
     except OSError as error:
-        there = ", ".join(serial_ports()) or "none"
-        cure = f"plug the scanner in and switch it on, or correct capture.scanner; ports here: {there}"
-        return Finding("port", "problem", f"{port}: {error.strerror}", cure)
+        return _no_port(f"{port}: {error.strerror}")
     if not stat.S_ISCHR(info.st_mode):
         return Finding("port", "problem", f"{port} is no serial port", "correct capture.scanner")
     if is_used:
         return Finding("port", "ok", f"{port}, in use by the node")
     return _opened(port)
+
+
+def _no_port(found: str) -> Finding:
+    there = ", ".join([*serial_ports(), *(port.address for port in find_ports() if port.address.startswith("usb:"))])
+    cure = f"plug the scanner in and switch it on, or correct its address; ports here: {there or 'none'}"
+    return Finding("port", "problem", found, cure)
+
+
+def _looked_up(address: str, is_used: bool) -> Finding:
+    """A port that is named by its USB ids."""
+    if is_used:
+        return Finding("port", "ok", f"{address}, in use by the node")
+    try:
+        open_port(address).close()
+    except PortLost as error:
+        return _no_port(str(error))
+    return Finding("port", "ok", address)
 
 
 def _opened(port: str) -> Finding:

@@ -81,6 +81,13 @@ def test_a_port_that_another_program_uses_is_a_problem_unless_it_is_the_node(por
         assert states(doctor.check_port(port, is_used=True)) == ["ok"]
 
 
+@pytest.mark.parametrize("address", ["usb:1209:5ca1:NONE", "serial:1209:5ca1:NONE", "usb:nonsense"])
+def test_a_scanner_named_by_its_ids_that_is_not_there_is_a_problem(address: str) -> None:
+    for finding in (doctor.check_port(address), *doctor.examine_scanner(address, None, {})):
+        assert (finding.check, finding.state) == ("port", "problem") and address in finding.found and finding.cure
+    assert states(doctor.check_port(address, is_used=True)) == ["ok"]
+
+
 @pytest.mark.parametrize("path", ["/dev/null", __file__])
 def test_what_is_no_serial_port_is_a_problem(path: str) -> None:
     assert states(doctor.check_port(path)) == ["problem"]

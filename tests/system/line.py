@@ -47,6 +47,7 @@ def run_line(stack: ExitStack, folder: Path, *simulate: str) -> RunningNode:
     link = ["simulate", "--path", str(folder / "scanner"), "--truth", str(truth), "--json", *simulate]
     _, scanner = stack.enter_context(started(*link))
     serve = ["serve", "--scanner", scanner["path"], "--library", str(folder / "library"), "--listen", "127.0.0.1:0"]
-    process, ready = stack.enter_context(started(*serve, "--insecure", "--json"))
+    beside = scanner.get("environment", {})  # of a node that shall see emulated USB
+    process, ready = stack.enter_context(started(*serve, "--insecure", "--json", environment=beside))
     sweep(ready["url"])
     return RunningNode(ready["url"], Truth.read(truth), process, folder)

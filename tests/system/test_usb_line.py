@@ -1,0 +1,77 @@
+"""The whole line over emulated USB: `foveascan simulate --link usb`, the daemon on libusb, the public client."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client.transfer import fetch_scan
+from exchange.native import read_native
+from foveascan import PROGRAM, started
+from protocol.grid import Grid
+from simulators.usb_testbed import PRELOAD, is_available
+from tests.system.line import RunningNode, run_line
+
+SEED = 7
+Swept = Callable[..., tuple[RunningNode, Grid]]
+
+
+@pytest.fixture(autouse=True)
+def _preload() -> None:
+    if not is_available() and "CI" not in os.environ:
+        pytest.skip(f"no {PRELOAD} here; as root: apt-get install umockdev libusb-1.0-0")
+
+
+@pytest.fixture
+def swept(tmp_path: Path) -> Swept:
+    """Sweeps a generated head over a kind of line; the node, and the scan as a client fetches it."""
+
+    def sweep(link: str, *simulate: str) -> tuple[RunningNode, Grid]:
+        folder = tmp_path / link
+        folder.mkdir()
+        with ExitStack() as stack:
+            path = ["--path", str(folder / "scanner")]
+            chosen = ["--link", link, *path, "--specimen", "head", "--seed", str(SEED), *simulate]
+            node = run_line(stack, folder, *chosen)
+            asyncio.run(fetch_scan(node.url, "latest", folder / "scan.npz", moved=lambda moved, total: None))
+            with open(folder / "scan.npz", "rb") as file:
+                return node, read_native(file)[1]
+
+    return sweep
+
+
+def test_one_seed_gives_one_scan_over_a_serial_line_and_over_usb(swept: Swept) -> None:  # AT-02
+    (node, serial), (_, usb) = swept("pty"), swept("usb")
+    assert np.array_equal(serial.range_steps, usb.range_steps) and np.array_equal(serial.texture, usb.texture)
+    assert np.array_equal(usb.range_steps, node.truth.range_steps)
+
+
+def test_one_seed_gives_one_scan_of_a_jittering_encoder_too(swept: Swept) -> None:  # AT-02
+    (_, serial), (_, usb) = (swept(link, "--jitter", "6") for link in ("pty", "usb"))
+    assert np.array_equal(serial.range_steps, usb.range_steps) and np.array_equal(serial.texture, usb.texture)
+
+
+def test_a_bad_usb_line_costs_the_scan_nothing(swept: Swept) -> None:  # AT-03
+    node, grid = swept("usb", "--faults", "loss=0.05,flip=0.02,truncate=0.01,unplug=0.5")
+    assert np.array_equal(grid.range_steps, node.truth.range_steps)
+    assert np.array_equal(grid.texture, node.truth.texture)
+
+
+def test_the_doctor_examines_a_scanner_on_usb(tmp_path: Path) -> None:
+    with started("simulate", "--link", "usb", "--path", str(tmp_path / "usb"), "--turn", "0.2", "--json") as (_, ready):
+        chosen = ("doctor", "--link", ready["path"], "--json")
+        environment = {**os.environ, **ready["environment"]}
+        ran = subprocess.run(
+            [*PROGRAM, *chosen], env=environment, capture_output=True, text=True, timeout=60, check=False
+        )
+    findings = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert [finding for finding in findings if finding["state"] != "ok"] == [] and ran.returncode == 0
+    assert {"greeting", "a sweep", "stopping"} <= {finding["check"] for finding in findings}
