@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import os
+from contextlib import suppress
 
 import aiohttp
 from aiohttp import ClientWebSocketResponse, ClientWSTimeout, WSCloseCode, WSMsgType
 
 from client.errors import NodeLost, RequestRefused
+from client.rest import ask
 from protocol import messages as m
 from protocol.errors import RemoteWireError
+from protocol.printable import printable
 from protocol.refinement import CRC, HEADER, MASK_MAX, PARAMETERS_MAX, PAYLOAD_MAX
 from protocol.session import Role, Said
 from protocol.session import Session as Order
@@ -21,6 +24,7 @@ HANDSHAKE_S = 10
 HEARTBEAT_S = 15
 CLOSE_S = 2
 CLOSE_REASON_MAX_BYTES = 120
+BUSY = 503
 
 
 class Stream:
@@ -51,7 +55,7 @@ class Stream:
         """The next thing the node says, and its size in bytes. Raises NodeLost or RemoteWireError."""
         message = await self._socket.receive()
         if message.type not in (WSMsgType.TEXT, WSMsgType.BINARY):
-            raise self._ended(message.data if message.type is WSMsgType.ERROR else None)
+            raise self._ended(message)
         data: str | bytes = message.data
         size = len(data.encode()) if isinstance(data, str) else len(data)
         self.bytes_received += size
@@ -72,10 +76,13 @@ class Stream:
         reason = str(violation or "").encode()[:CLOSE_REASON_MAX_BYTES].decode(errors="ignore").encode()
         await self._socket.close(code=code, message=reason)
 
-    def _ended(self, cause: object) -> NodeLost | RemoteWireError:
-        if isinstance(cause, aiohttp.WebSocketError):
-            return RemoteWireError(f"{self.url} broke the WebSocket protocol: {cause}")
-        why = cause or f"the node closed the stream ({self._socket.close_code})"
+    def _ended(self, last: aiohttp.WSMessage) -> NodeLost | RemoteWireError:
+        if isinstance(last.data, aiohttp.WebSocketError):
+            return RemoteWireError(f"{self.url} broke the WebSocket protocol: {last.data}")
+        reason = f": {printable(str(last.extra))}" if last.type is WSMsgType.CLOSE and last.extra else ""
+        why = f"the node closed the stream ({self._socket.close_code}){reason}"
+        if last.type is WSMsgType.ERROR and last.data:
+            why = str(last.data)
         return NodeLost(f"lost {self.url}: {why}; connect again once the node is back")
 
 
@@ -105,7 +112,7 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
     except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, ValueError) as error:
         raise NodeLost(f"{url!r} is no address of a node; use http://HOST:PORT") from error
     except aiohttp.WSServerHandshakeError as error:
-        raise _refusal(url, error.status) from error
+        raise await _refusal(http, url, error.status) from error
     except aiohttp.ClientConnectorError as error:
         why = _reason(error.os_error)
         raise NodeLost(f"no node at {url}: {why}; check the address, or start one with `foveascan serve`") from error
@@ -124,7 +131,13 @@ def _reason(error: OSError) -> str:
     return (error.strerror or str(error)).lower()
 
 
-def _refusal(url: str, status: int) -> NodeLost | RequestRefused:
+async def _refusal(http: aiohttp.ClientSession, url: str, status: int) -> NodeLost | RequestRefused:
     if status in (401, 403):
         return RequestRefused("forbidden", "it wants a token; pass the one it was paired with")
-    return NodeLost(f"{url} answers with HTTP {status}: it is no foveascan node, or a busy one")
+    if status == BUSY:
+        with suppress(NodeLost, RemoteWireError):
+            try:
+                await ask(http, "GET", f"{url}{PATH}")  # a handshake keeps the reason for itself
+            except RequestRefused as refused:
+                return RequestRefused("busy", refused.message)
+    return NodeLost(f"{url} answers with HTTP {status}: it is no foveascan node")

@@ -11,6 +11,8 @@ import asyncio
 import logging
 import time
 from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 
 from aiohttp import WSMsgType, web
@@ -32,6 +34,7 @@ log = logging.getLogger(__name__)
 OPENS_MAX = 4
 HELLO_S = 10.0
 ACK_S = 60.0
+CLOSE_S = 2.0
 QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
 CLOSE_PROTOCOL_ERROR = 1002
 CLOSE_REASON_MAX = 120  # of 123 bytes
@@ -103,7 +106,7 @@ class Connection:
     # -- reading ---------------------------------------------------------------------------------------------------
 
     async def _let_in(self) -> bool:
-        async with asyncio.timeout(HELLO_S):
+        async with _patience(HELLO_S, "hello"):
             message = await self._receive()
         if message is None:
             return False
@@ -213,7 +216,7 @@ class Connection:
 
     async def _await_ack(self) -> None:
         if self._bound is not None:
-            async with asyncio.timeout(ACK_S):
+            async with _patience(ACK_S, "ack"):
                 await self._acknowledged.wait()
 
     async def _open(self, wanted: m.Open) -> None:
@@ -315,7 +318,19 @@ class Connection:
     async def _turn_away(self, why: str) -> None:
         log.warning("stream ended: %s", why)
         if not self._socket.closed:
-            await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=_cut(why))
+            with suppress(TimeoutError):  # one that does not read either
+                async with asyncio.timeout(CLOSE_S):
+                    await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=_cut(why))
+
+
+@asynccontextmanager
+async def _patience(wait_s: float, expected: str) -> AsyncIterator[None]:
+    """Raises RemoteWireError when a client does not say what is expected of it in time."""
+    try:
+        async with asyncio.timeout(wait_s):
+            yield
+    except TimeoutError:
+        raise RemoteWireError(f"no {expected} within {wait_s:g} s") from None
 
 
 def _cut(reason: str) -> bytes:

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 from dataclasses import asdict
+from typing import cast
 
 import msgspec
 from aiohttp import web
@@ -23,6 +24,7 @@ from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
 from node.live import Live
 from node.page import Page
+from node.refine_texture import CODECS
 from node.shared import SharedFoveae
 from protocol import messages as m
 from protocol.errors import LibraryError
@@ -36,6 +38,7 @@ HEARTBEAT_S = 20.0
 BODY_MAX_BYTES = 1 << 16
 GOODBYE_S = 1.0
 REQUESTS_S = 1.0  # that requests in work get to end when the node stops
+ANSWERED = web.RequestKey("answered", bool)  # the head of the answer is made
 SECURITY_HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -139,8 +142,10 @@ class NodeServer:
 
     async def _coarse(self, request: web.Request) -> web.Response:
         """The first view as its two refinements, one behind the other, each behind its length (u32, little-endian)."""
-        codec: m.CodecName = "jpeg" if request.query.get("codec") == "jpeg" else "htj2k"
-        _, view = await self._exhibits.open(request.match_info["scan"], codec)
+        codec = request.query.get("codec", "htj2k")
+        if codec not in CODECS:
+            raise web.HTTPBadRequest(text=f"codec must be one of {', '.join(CODECS)}")
+        _, view = await self._exhibits.open(request.match_info["scan"], cast("m.CodecName", codec))
         body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
         return web.Response(body=body, content_type="application/octet-stream", headers=self._shared.cache_headers)
 
@@ -152,7 +157,8 @@ class NodeServer:
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         if len(self._connections) >= self._config.server.max_clients:
-            raise web.HTTPServiceUnavailable(text="too many clients: try again later")
+            there = f"{len(self._connections)} clients are there"
+            raise web.HTTPServiceUnavailable(text=f"{there}, all that server.max_clients allows: try again later")
         stream = web.WebSocketResponse(
             protocols=(m.PROTOCOL,), max_msg_size=m.TEXT_MAX, heartbeat=HEARTBEAT_S, compress=False,
             writer_limit=WRITE_LIMIT_BYTES,
@@ -198,18 +204,42 @@ def _bound_buffers(transport: asyncio.Transport) -> None:
 
 
 async def _harden(request: web.Request, response: web.StreamResponse) -> None:
+    request[ANSWERED] = True
     for name, value in SECURITY_HEADERS.items():
         response.headers.setdefault(name, value)
 
 
 @web.middleware
 async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Errors as one JSON object: what is wrong, and where it can be known, the cure."""
+    """Errors as one JSON object: what is wrong, and where it can be known, the cure. A bug is a line in the log."""
     try:
         return await handler(request)
     except LibraryError as error:
-        return _json({"code": "not found", "message": str(error)}, status=404)
+        return _refusal(404, "not found", str(error))
     except web.HTTPException as error:
         if error.status < 400:
             raise
-        return _json({"code": (error.reason or "").lower(), "message": error.text}, status=error.status)
+        refusal = _refusal(error.status, error.reason.lower(), _what(request, error))
+        if "Allow" in error.headers:
+            refusal.headers["Allow"] = error.headers["Allow"]
+        return refusal
+    except Exception as error:
+        if isinstance(error, ConnectionError) or ANSWERED in request:
+            raise  # nobody is there to be told, or half an answer is on its way
+        log.error("%s %s: %s: %s", request.method, request.path, type(error).__name__, error)
+        return _refusal(500, "internal server error", "the node has failed at this: its log says how")
+
+
+def _refusal(status: int, code: str, message: str) -> web.Response:
+    return _json({"code": code, "message": message}, status)
+
+
+def _what(request: web.Request, error: web.HTTPException) -> str:
+    """What is wrong, in our words where aiohttp has none but the status."""
+    if error.text and error.text != f"{error.status}: {error.reason}":
+        return error.text
+    if error.status == 404:
+        return f"nothing is at {request.path[:100]}"
+    if error.status == 405:
+        return f"{request.path[:100]} takes no {request.method}"
+    return error.reason

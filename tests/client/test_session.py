@@ -718,6 +718,33 @@ async def test_a_node_behind_a_login_is_a_refusal() -> None:
                 pass
 
 
+@pytest.mark.parametrize(
+    ("answer", "error", "told"),
+    [
+        ('{"code": "service unavailable", "message": "64 are there"}', RequestRefused, "busy.*64 are there"),
+        ("sorry", NodeLost, "HTTP 503: it is no foveascan node"),
+    ],
+)
+async def test_a_node_without_a_place_tells_why(answer: str, error: type[Exception], told: str) -> None:
+    async def refuse(request: web.Request) -> web.Response:
+        return web.Response(status=503, text=answer)
+
+    async with serving(show_and_answer, web.get("/full/v1/stream", refuse)) as url:
+        with pytest.raises(error, match=told):
+            async with connect(f"{url}/full"):
+                pass
+
+
+async def test_why_a_node_closed_the_stream_is_told() -> None:
+    async def script(line: Line) -> None:
+        await greet(line)
+        await line.socket.close(code=1002, message=b"no ack within 60 s")
+
+    async with serving(script) as url, connect(url) as session:
+        with pytest.raises(NodeLost, match=r"the node closed the stream \(1002\): no ack within 60 s"):
+            await session.open()
+
+
 async def test_a_hello_that_is_refused_names_the_reason() -> None:
     async def script(line: Line) -> None:
         await line.say(INFO)

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType
 
+from node import connection
 from node.library import About, Library
 from protocol import messages as m
 from protocol.codec import TextureCodec
@@ -78,6 +79,26 @@ async def test_a_client_that_likes_jpeg_gets_better_texture_than_that_has(
     ended = m.decode_message((await stream.receive()).data)
     assert isinstance(ended, m.Updated) and ended.texture_db is not None and ended.texture_db >= texture_db
     await stream.close()
+
+
+async def test_a_client_that_says_nothing_is_told_why_it_is_sent_away(
+    node: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "HELLO_S", 0.05)
+    stream = await node.ws_connect("/v1/stream", protocols=[m.PROTOCOL])
+    await stream.receive()
+    end = await stream.receive()
+    assert (end.type, end.data, end.extra) == (WSMsgType.CLOSE, 1002, "no hello within 0.05 s")
+
+
+async def test_a_client_that_acknowledges_nothing_is_told_why_it_is_sent_away(
+    node: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "ACK_S", 0.05)
+    stream, _ = await opened(node)
+    await stream.send_str(m.encode_message(m.Look(7, 0.5, 0.5)))
+    end = await stream.receive()
+    assert (end.type, end.data, end.extra) == (WSMsgType.CLOSE, 1002, "no ack within 0.05 s")
 
 
 @pytest.mark.parametrize("letter", ["a", "é", "中", "😀"])

@@ -67,6 +67,39 @@ async def test_a_sweep_is_refused_with_the_reason_while_the_scanner_is_not_ready
         assert await ask(node, "/v1/sweeps", "POST") == (409, {"code": "conflict", "message": why})
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "status", "message"),
+    [
+        ("GET", "/v1/nothing", 404, "nothing is at /v1/nothing"),
+        ("DELETE", "/v1/node", 405, "/v1/node takes no DELETE"),
+        ("GET", "/v1/scans/latest/coarse?codec=zzz", 400, "codec must be one of jpeg, htj2k"),
+        ("GET", "/v1/scans/latest/coarse", 404, "there is no scan yet: start a sweep"),
+    ],
+)
+async def test_what_cannot_be_is_told_in_words(
+    tmp_path: Path, method: str, path: str, status: int, message: str
+) -> None:
+    async with served(Library(tmp_path)) as (node, _), node.request(method, path) as answer:
+        assert (answer.status, (await answer.json())["message"]) == (status, message)
+        assert ("Allow" in answer.headers) == (status == 405)
+
+
+async def test_a_bug_is_a_line_in_the_log_and_tells_a_client_nothing_of_the_inside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail() -> None:
+        raise KeyError("secret")
+
+    library = Library(tmp_path)
+    monkeypatch.setattr(library, "scans", fail)
+    async with served(library) as (node, _):
+        status, said = await ask(node, "/v1/scans")
+    message = "the node has failed at this: its log says how"
+    assert (status, said) == (500, {"code": "internal server error", "message": message})
+    (record,) = caplog.records
+    assert record.getMessage() == "GET /v1/scans: KeyError: 'secret'" and record.exc_info is None
+
+
 async def test_a_scan_says_when_it_was_made(tmp_path: Path) -> None:
     library = Library(tmp_path)
     async with served(library) as (node, _):
