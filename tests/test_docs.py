@@ -38,6 +38,7 @@ from tests.system.line import RunningNode, run_line
 
 ROOT = Path(__file__).parents[1]
 README, ARCHITECTURE, PROTOCOL = ((ROOT / name).read_text() for name in ("README.md", "ARCHITECTURE.md", "PROTOCOL.md"))
+VIEWER = ROOT / "client/viewer"
 PACKAGES = ("protocol", "drivers", "exchange", "node", "client", "simulators")
 
 
@@ -65,6 +66,19 @@ def defined_in(path: Path) -> set[str]:
     return names
 
 
+def defined_in_page(path: Path) -> set[str]:
+    """Names a TypeScript file defines: functions, classes, constants, Class.method."""
+    names: set[str] = set()
+    owner = ""
+    for line in path.read_text().splitlines():
+        if outer := re.match(r"(?:export )?(?:async )?(?:class|function|const|interface|type) (\w+)", line):
+            owner = outer[1]
+            names.add(owner)
+        elif inner := re.match(r"  (?:(?:private|readonly|static|async|get) )*(\w+)[(<]", line):
+            names.add(f"{owner}.{inner[1]}")
+    return names
+
+
 @pytest.mark.parametrize("text", [README, ARCHITECTURE, PROTOCOL], ids=["README", "ARCHITECTURE", "PROTOCOL"])
 def test_files_named_with_their_folder_exist(text: str) -> None:
     named = set(re.findall(r"`((?:protocol|drivers|exchange|node|client|simulators|tests)/[\w/.-]*)", text))
@@ -75,12 +89,15 @@ def test_files_named_with_their_folder_exist(text: str) -> None:
 @pytest.mark.parametrize("text", [README, ARCHITECTURE, PROTOCOL], ids=["README", "ARCHITECTURE", "PROTOCOL"])
 def test_links_between_pages_lead_somewhere(text: str) -> None:
     for file, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+        assert (ROOT / file).exists(), file
+        if not anchor:
+            continue
         target = (ROOT / file).read_text() if file else text
         headings = {
             re.sub(r"[^\w -]", "", line.lower()).replace(" ", "-")
             for line in re.findall(r"^#+ (.*)$", target, re.MULTILINE)
         }
-        assert not anchor or anchor in headings, anchor
+        assert anchor in headings, anchor
 
 
 def test_rooms_of_the_architecture_exist() -> None:
@@ -95,8 +112,15 @@ def test_functions_are_in_the_files_named_with_them() -> None:
     assert [pair for pair in pairs if pair[1] not in defined_in(ROOT / pair[0])] == []
 
 
+def test_functions_of_the_page_are_in_the_files_named_with_them() -> None:
+    pairs = re.findall(r"`(src/[\w/]+\.ts)`(?:\s+`([\w.]+)`)?", ARCHITECTURE)
+    assert len(pairs) > 20
+    assert [pair for pair in pairs if not {pair[1]} - {""} <= defined_in_page(VIEWER / pair[0])] == []
+
+
 def test_every_other_name_of_the_architecture_is_defined_somewhere() -> None:
     known = {name for package in PACKAGES for path in (ROOT / package).glob("*.py") for name in defined_in(path)}
+    known |= {name for path in (VIEWER / "src").rglob("*.ts") for name in defined_in_page(path)}
     named = set(re.findall(r"`(_?[A-Z]\w+(?:\.\w+)?|\w+_\w+|_\w+)`", ARCHITECTURE))
     of_others = {"call_soon_threadsafe", "max_bytes", "max_wait_s", "range_mm", "git_"}
     assert sorted(named - known - of_others) == []
