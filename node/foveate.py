@@ -19,7 +19,7 @@ import numpy as np
 from node.coded import Coded, wire_overhead
 from node.library import Scan
 from node.quality import FILL, Point, QualitySearch
-from node.range_bitmaps import mend_range
+from node.range_bitmaps import reach_range
 from node.refine_range import (
     QUANTUM_MAX,
     choose_range,
@@ -56,6 +56,7 @@ from protocol.region import Region, region_round
 
 REPLY_BYTES = 220  # the Updated message that ends an update, carrier included
 RANGE_OVERHEAD_BYTES = wire_overhead(Parameters(2, 0, 0, 1, 1)) + 64  # a void mask included
+WHOLE_SHARE = 0.7  # of what a whole window takes: where a part takes more, the whole is tried too
 TEXTURE_BYTES_MIN = 128  # for less, no texture is tried
 HELD_MARGIN = 0.95  # what is held is known block by block, not texel by texel
 RANGE_MARGIN = 1.1  # expectations of range are a tenth off
@@ -167,7 +168,8 @@ class _Planner:
             return
         wanted, range_bytes = self._divide()
         texture = self._search_texture(self._left - range_bytes)
-        self._take(self._fill_range(wanted, self._left - (texture.wire_bytes if texture else 0)))
+        for coded in self._fill_range(wanted, self._left - (texture.wire_bytes if texture else 0)):
+            self._take(coded)
         self._take(texture)
         if self._look.fill and not self._limited and math.isfinite(self._left):
             self._fill_periphery(wanted)
@@ -251,10 +253,22 @@ class _Planner:
         if self._model is not None and (held := self._texture_error(None)) <= HELD_MARGIN * self._target_mse:
             self._texture_db = db_of_mse(held)
             return None
+        listed = listed_texture(self._state, self._texture_region, self._target_mse)
+        found = self._search_spacings(limit_bytes, listed)
+        if listed is None or found is None or found.wire_bytes < WHOLE_SHARE * self._expected_whole_bytes():
+            return found
+        whole = self._search_spacings(limit_bytes, None)  # one quality all over may cost less than a good one in parts
+        return whole if whole is not None and whole.wire_bytes < found.wire_bytes else found
+
+    def _expected_whole_bytes(self) -> float:
+        expected = self._expected()
+        return expected.size_bytes(expected.quality_for_mse(self._target_mse))
+
+    def _search_spacings(self, limit_bytes: float, listed: tuple[int, ...] | None) -> Coded | None:
         finest = choose_spacing(self._scan, self._state, self._texture_region, self._look.texture_db, self._codec)
         for p in (spacing for spacing in reversed(SPACINGS) if spacing >= finest):
             search = QualitySearch(self._target_mse, limit_bytes, self._expected(), *quality_bounds(self._codec))
-            wanted_any = self._try_qualities(search, p)
+            wanted_any = self._try_qualities(search, p, listed)
             self._limited |= search.limited
             found = search.best()
             if found is not None:
@@ -264,10 +278,10 @@ class _Planner:
                 return None
         return None
 
-    def _try_qualities(self, search: QualitySearch, p: float) -> bool:
+    def _try_qualities(self, search: QualitySearch, p: float, listed: tuple[int, ...] | None) -> bool:
         """Feed a search; False when the client holds all of this already."""
         while (quality := search.next_quality()) is not None:
-            coded = self._code_listed(TextureParameters(p, quality, self._codec, self._skirt(p)))
+            coded = self._code_listed(TextureParameters(p, quality, self._codec, self._skirt(p)), listed)
             if coded is None:
                 if self._texture_error(None) <= self._target_mse:
                     return False
@@ -303,14 +317,20 @@ class _Planner:
 
     # -- range -----------------------------------------------------------------------------------------------------
 
-    def _fill_range(self, wanted: RangeParameters, limit_bytes: float) -> Coded | None:
+    def _fill_range(self, wanted: RangeParameters, limit_bytes: float) -> list[Coded]:
         """Range as wanted; where the limit binds, with the smallest quantum that fits it."""
         if not (self._limited and math.isfinite(limit_bytes)):
             self._count_encode()
-            coded = mend_range(self._scan, self._state, self._range_region, wanted, self._target_steps)
-            if coded is None or coded.wire_bytes <= limit_bytes:
-                return coded
+            found = reach_range(self._scan, self._state, self._range_region, wanted, self._target_steps)
+            self._encodes += len(found) - 1 if found else 0
+            if sum(coded.wire_bytes for coded in found) <= limit_bytes:
+                return found
             self._limited = True
+        coded = self._range_within(wanted, limit_bytes)
+        return [coded] if coded is not None else []
+
+    def _range_within(self, wanted: RangeParameters, limit_bytes: float) -> Coded | None:
+        """Range with the smallest quantum that fits a limit that binds."""
         wanted = self._affordable(wanted, limit_bytes)
         coded = self._first_that_fits(wanted, limit_bytes)
         if coded is None or coded.quality == 1 or coded.wire_bytes >= FILL * limit_bytes:
@@ -370,13 +390,10 @@ class _Planner:
         self._count_encode()
         return code_texture(self._scan, self._state, self._texture_region, wanted, quick=self._quick)
 
-    def _code_listed(self, wanted: TextureParameters) -> Coded | None:
-        """The same, but for blocks that are held well enough."""
+    def _code_listed(self, wanted: TextureParameters, listed: tuple[int, ...] | None) -> Coded | None:
+        """The same for some blocks of the window (None: all)."""
         self._count_encode()
-        parameters = replace(
-            texture_lattice(self._texture_region, wanted),
-            listed=listed_texture(self._state, self._texture_region, self._target_mse),
-        )
+        parameters = replace(texture_lattice(self._texture_region, wanted), listed=listed)
         codec = CODECS[wanted.codec]
         return code_texture_lattice(
             self._scan, self._state, parameters, wanted.quality, codec, quick=self._quick

@@ -1,4 +1,4 @@
-"""Range refinements that list their blocks: what a client holds is mended where a new window needs it better.
+"""Range refinements that list their blocks: what a client holds is left alone, or mended where it is too poor.
 
 Sending a window at spacing 2 and its creased blocks again at spacing 1 was tried too: since range is coded by lifting,
 which spends nothing where interpolation suffices, it saved 0.1% over 15 windows of real scans, and is not done.
@@ -20,46 +20,99 @@ from node.refine_range import (
     PERCENTILE,
     client_range,
     code_range_lattice,
+    note_range,
     range_lattice,
 )
 from node.state import ClientState
-from protocol.grid import RANGE_BLOCK, VOID
-from protocol.holdings import COARSE_RANK
+from protocol.grid import RANGE_BLOCK, VOID, BoolArray
+from protocol.holdings import COARSE_RANK, range_rank
 from protocol.lattice import Channel, ChannelShape, mask_to_runs
 from protocol.messages import RangeParameters
 from protocol.reconstruct import cut
 from protocol.region import Region
 
 LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
+TRIES_MAX = 4
 FEW_CELLS = 1  # too far off in a block that counts as good
 
 
-def mend_range(
+def reach_range(
     scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, target_steps: float
-) -> Coded | None:
-    """Encode a refinement after which the whole region is within target_steps, held blocks included.
+) -> list[Coded]:
+    """Encode refinements after which the whole region is within target_steps, held blocks included.
 
-    Blocks held well enough are left out by a bitmap. Others may have been good enough for the window they were sent for
-    and be too poor, all together, for this one: where they are, they are sent again, finer, and nothing else is.
+    Blocks held well enough are left out by a bitmap, and so are those held at better values than wanted, since what
+    improves them would have to be as good throughout. Where what is kept turns out too poor for this window, it is sent
+    again by itself, finer.
     """
     held = state.holdings.channels[Channel.RANGE]
-    good = _of_region((held.rank > COARSE_RANK) & (state.cells_beyond(target_steps) <= FEW_CELLS), region)
-    listed = mask_to_runs(~good) if good.mean() >= LISTED_SHARE else None
-    coded = code_range_lattice(scan, state, replace(range_lattice(region, wanted), listed=listed), wanted.quantum)
-    kept = np.ones(held.shape.blocks, np.bool_)
+    rank = _of_region(held.rank, region)
+    good = (rank > COARSE_RANK) & (_of_region(state.cells_beyond(target_steps), region) <= FEW_CELLS)
+    better = rank > range_rank(wanted.quantum)
+    apart = good | better if better.any() or good.mean() >= LISTED_SHARE else np.zeros_like(good)
+    allowed = _allowed_beyond(scan, region)
+    coded = _code_listed(scan, state, region, wanted, apart)
+    for _ in range(TRIES_MAX):
+        if coded is None or _cells_beyond(scan, coded, region, target_steps) <= allowed:
+            break
+        wanted = RangeParameters(p=wanted.p, quantum=max(wanted.quantum * 3 // 4, 1), s=wanted.s)
+        coded = _code_listed(scan, state, region, wanted, apart)
+    after = state.copy()
     if coded is not None:
-        kept.ravel()[coded.selection.adopted_blocks()] = False
-    poor = np.where(_of_region(kept, region), _of_region(state.cells_beyond(target_steps), region), 0)
-    poor = np.minimum(poor, _cells_inside(held.shape, region))
-    if poor.sum() + _cells_beyond(scan, coded, region, target_steps) <= _allowed_beyond(scan, region):
-        return coded
-    finer = 65535 - int(_of_region(held.rank, region)[poor > 0].max(initial=0)) - 1
-    quantum = min(wanted.quantum, 2 * int(target_steps) + 1, finer)
+        note_range(scan, after, coded, target_steps)
+    first = [coded] if coded is not None else []
+    poor = np.minimum(_of_region(after.cells_beyond(target_steps), region), _cells_inside(held.shape, region))
+    kept = ~_of_region(_adopted(held.shape, coded), region)
+    if poor[kept].sum() + _cells_beyond(scan, coded, region, target_steps) <= allowed:
+        return first
+    second = _mend(scan, after, region, wanted, target_steps, poor, allowed)
+    return [*first, second] if second is not None else first
+
+
+def _mend(
+    scan: Scan,
+    state: ClientState,
+    region: Region,
+    wanted: RangeParameters,
+    target_steps: float,
+    poor: NDArray[np.int64],
+    allowed: int,
+) -> Coded | None:
+    """Encode the poor blocks again: at the spacing wanted where that makes them good enough, else at spacing 1."""
+    held = state.holdings.channels[Channel.RANGE]
+    rank, level = (_of_region(array, region)[poor > 0] for array in (held.rank, held.level))
+    best = 65535 - int(rank.max())
+    if wanted.p > 1 and level.min() >= _level_at(wanted.p):
+        coded = _code_listed(scan, state, region, RangeParameters(wanted.p, best - 1, None), poor == 0)
+        if coded is not None and _cells_beyond(scan, coded, region, target_steps) <= allowed // 2:
+            return coded
+    quantum = min(2 * int(target_steps) + 1, best - 1)  # at spacing 1 no cell is off by more than half a quantum
     if quantum < 1:
-        return coded
-    again = mask_to_runs((poor > 0) | ~_of_region(kept, region))
-    exact = RangeParameters(p=1, quantum=quantum, s=None)  # at spacing 1 no cell is off by more than half a quantum
-    return code_range_lattice(scan, state, replace(range_lattice(region, exact), listed=again), quantum)
+        return None
+    return _code_listed(scan, state, region, RangeParameters(1, quantum, None), poor == 0)
+
+
+def _level_at(p: int) -> int:
+    """Level of a block at spacing p, a power of two."""
+    return 2 * (p.bit_length() - 1)
+
+
+def _code_listed(
+    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, apart: BoolArray
+) -> Coded | None:
+    """Encode the region's blocks but for those apart."""
+    parameters = range_lattice(region, wanted)
+    if apart.any():
+        parameters = replace(parameters, listed=mask_to_runs(~apart))
+    return code_range_lattice(scan, state, parameters, wanted.quantum)
+
+
+def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:
+    """Which blocks a refinement changes. (blocks_y, blocks_x)"""
+    adopted = np.zeros(shape.blocks, np.bool_)
+    if coded is not None:
+        adopted.ravel()[coded.selection.adopted_blocks()] = True
+    return adopted
 
 
 def _cells_inside(shape: ChannelShape, region: Region) -> NDArray[np.int64]:

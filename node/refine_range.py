@@ -27,6 +27,7 @@ from protocol.region import Region
 SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
 PERCENTILE = 99
 QUANTUM_MAX = 4096
+FINENESS_COSTS = 0.35  # blocks held at a small quantum can only be made finer at one as small (F-09c)
 QUANTUM_SHARE_MAX = 2.5  # of the target; the error is at most half a quantum, less after interpolation
 
 
@@ -51,7 +52,7 @@ def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: f
         if trial.error(1) > target_steps:
             continue
         quantum = _largest_quantum(trial, target_steps)
-        size_bytes = trial.expected_bytes(quantum)
+        size_bytes = trial.expected_bytes(quantum) * max(2 * target_steps / quantum, 1) ** FINENESS_COSTS
         if best is not None and size_bytes >= best.expected_bytes:
             break
         best = Choice(RangeParameters(p=p, quantum=quantum), trial.error(quantum), size_bytes)
