@@ -11,19 +11,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from client.discovery import NodeAddress, discover
-    from client.errors import NodeLost, RequestRefused
+    from client.errors import NodeLost, NodeNotTrusted, RequestRefused
     from client.model import Model
+    from client.pairing import pair
     from client.session import Session, connect
     from client.update import Sent, Update
 
-__all__ = ["Model", "NodeAddress", "NodeLost", "RequestRefused", "Sent", "Session", "Update", "connect", "discover"]
+__all__ = [
+    "Model", "NodeAddress", "NodeLost", "NodeNotTrusted", "RequestRefused", "Sent", "Session", "Update", "connect",
+    "discover", "pair",
+]  # fmt: skip
 
 _HOMES = {
     "NodeAddress": "client.discovery",
     "discover": "client.discovery",
     "NodeLost": "client.errors",
+    "NodeNotTrusted": "client.errors",
     "RequestRefused": "client.errors",
     "Model": "client.model",
+    "pair": "client.pairing",
     "Session": "client.session",
     "connect": "client.session",
     "Sent": "client.update",

@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from client.discovery import NodeAddress
 
 TIMEOUT_MAX_S = 3600
 BYTES_MAX = 1 << 40
@@ -16,17 +20,18 @@ def add_search(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--timeout", type=seconds, default=3.0, metavar="S", help="seconds to search for nodes (3)")
 
 
-def add_node(parser: argparse.ArgumentParser) -> None:
-    """Offer --node, --token, and what `add_search` does."""
+def add_node(parser: argparse.ArgumentParser, *, token: bool = True) -> None:
+    """Offer --node, --token where one is of use, and what `add_search` does."""
     add_search(parser)
-    parser.add_argument("--node", metavar="URL", help="http://HOST:PORT of a node (the one that discovery finds)")
-    parser.add_argument("--token", help="what the node was paired with")
+    parser.add_argument("--node", metavar="URL", help="https://HOST:PORT of a node (the one that discovery finds)")
+    if token:
+        parser.add_argument("--token", help="instead of what `foveascan join` has kept")
 
 
-async def node_url(args: argparse.Namespace) -> str:
-    """The URL that --node names, else that of the one node on this network. Raises NodeLost unless there is one."""
+async def chosen_node(args: argparse.Namespace) -> NodeAddress | str:
+    """What --node names, else the one node on this network. Raises NodeLost unless there is one."""
     if args.node:
-        return str(args.node.rstrip("/"))
+        return str(args.node)
     from client.discovery import discover
     from client.errors import NodeLost
 
@@ -35,7 +40,7 @@ async def node_url(args: argparse.Namespace) -> str:
         raise no_node(args.timeout)
     if len(nodes) > 1:
         raise NodeLost(f"{len(nodes)} nodes answer; choose one: --node {' or '.join(node.url for node in nodes)}")
-    return nodes[0].url
+    return nodes[0]
 
 
 def no_node(timeout_s: float) -> Exception:

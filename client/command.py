@@ -1,4 +1,4 @@
-"""The subcommands `discover`, `scan`, `scans`, `export`, `import` and `look`: a headless client."""
+"""The subcommands `discover`, `join`, `scan`, `scans`, `export`, `import` and `look`: a headless client."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from client import exchange_command, scan_command, scans_command
-from client.arguments import add_node, add_search, between, byte_count, no_node, node_url, number, share
+from client import exchange_command, join_command, scan_command, scans_command
+from client.arguments import add_node, add_search, between, byte_count, chosen_node, no_node, number, share
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -21,12 +21,13 @@ CENTRE = (0.5, 0.5)
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Offer `discover`, `scan`, `scans`, `export`, `import` and `look`."""
+    """Offer `discover`, `join`, `scan`, `scans`, `export`, `import` and `look`."""
     finder = subparsers.add_parser("discover", help="list the nodes on this network")
     add_search(finder)
     finder.add_argument("--name", help="stop at the node of this name or id")
     finder.set_defaults(run=run_discover)
 
+    join_command.add_subcommands(subparsers)
     scan_command.add_subcommands(subparsers)
     scans_command.add_subcommands(subparsers)
     exchange_command.add_subcommands(subparsers)
@@ -82,7 +83,7 @@ async def _look(args: argparse.Namespace) -> None:
 
     clicks = args.at or [CENTRE]
     with _progress(args, 1 + len(clicks), "looking") as bar:
-        async with connect(await node_url(args), token=args.token) as session:
+        async with connect(await chosen_node(args), token=args.token) as session:
             model = await session.open(args.scan, profile=args.profile)
             bar.update()
             s = model.info
@@ -111,7 +112,10 @@ async def _look_at(session: Session, args: argparse.Namespace, u: float, v: floa
 
 
 def _node_record(node: NodeAddress) -> dict[str, Any]:
-    return {"name": node.name, "id": node.id, "state": node.state, "url": node.url, "tls": node.tls}
+    return {
+        "name": node.name, "id": node.id, "state": node.state, "url": node.url, "tls": node.tls,
+        "fingerprint": node.fingerprint,
+    }  # fmt: skip
 
 
 def _update_record(u: float, v: float, update: Update) -> dict[str, Any]:

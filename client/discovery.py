@@ -16,7 +16,10 @@ SETTLE_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
-    """Where a node listens, and what it says of itself: stable id, readable name, state, whether it speaks TLS."""
+    """Where a node listens, and what it says of itself: stable id, readable name, state, whether it speaks TLS.
+
+    fingerprint : SHA-256 of its certificate, hex, as announced. Anybody can announce anything: it proves nothing.
+    """
 
     name: str
     host: str
@@ -24,6 +27,7 @@ class NodeAddress:
     id: str
     state: str
     tls: bool
+    fingerprint: str = ""
 
     @property
     def url(self) -> str:
@@ -99,7 +103,10 @@ def _address(info: AsyncServiceInfo) -> NodeAddress | None:
         return None
     text = {_printable(key): _printable(value or b"") for key, value in info.properties.items()}
     name = text.get("name") or _printable(info.get_name().encode())
-    return NodeAddress(name, hosts[0], info.port, text.get("id", ""), text.get("state", ""), text.get("tls") == "1")
+    return NodeAddress(
+        name, hosts[0], info.port, text.get("id", ""), text.get("state", ""), text.get("tls") == "1",
+        text.get("fp", ""),
+    )  # fmt: skip
 
 
 def _printable(raw: bytes) -> str:

@@ -2,6 +2,7 @@
 
 FoveascanError
 ├── NodeLost        no node there, or not any more
+├── NodeNotTrusted  somebody answers who is not the node we mean
 ├── RequestRefused  the node understood, and said no
 └── HoldingsDiffer  node and client disagree on what the client has; the session states it anew
 """
@@ -11,6 +12,10 @@ from protocol.errors import FoveascanError
 
 class NodeLost(FoveascanError):
     """There is no node at that address, or the stream to it has ended."""
+
+
+class NodeNotTrusted(FoveascanError):
+    """Who answers there cannot show to be the node we mean; it was told nothing."""
 
 
 class RequestRefused(FoveascanError):

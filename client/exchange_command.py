@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from client.arguments import add_node, node_url, number, positive
+from client.arguments import add_node, chosen_node, number, positive
 
 if TYPE_CHECKING:
     from client.transfer import Moved
@@ -74,9 +74,9 @@ def run_import(args: argparse.Namespace) -> int:
 async def _export(args: argparse.Namespace) -> int:
     from client.transfer import fetch_scan
 
-    url = await node_url(args)
+    node = await chosen_node(args)
     with _bar(args, "fetching") as moved:
-        return await fetch_scan(url, args.scan, args.file, token=args.token, moved=moved)
+        return await fetch_scan(node, args.scan, args.file, token=args.token, moved=moved)
 
 
 async def _import(args: argparse.Namespace, name: str, grid: Grid) -> str:
@@ -85,10 +85,10 @@ async def _import(args: argparse.Namespace, name: str, grid: Grid) -> str:
     from client.transfer import send_scan
     from exchange.native import write_native
 
-    url = await node_url(args)
+    node = await chosen_node(args)
     with tempfile.TemporaryFile() as file, _bar(args, "sending") as moved:
         write_native(grid, file, name)
-        return await send_scan(url, file, token=args.token, moved=moved)
+        return await send_scan(node, file, token=args.token, moved=moved)
 
 
 def _check_grid(path: Path) -> None:

@@ -7,20 +7,25 @@ from typing import Any
 import aiohttp
 import msgspec
 
-from client.errors import NodeLost, RequestRefused
+from client.errors import RequestRefused
+from client.trust import trouble
 from protocol.errors import RemoteWireError
 
 BODY_MAX_BYTES = 4 << 20
 TIMEOUT = aiohttp.ClientTimeout(total=30)
 
 
-async def ask(http: aiohttp.ClientSession, method: str, url: str) -> Any:
-    """The JSON a node answers with. Raises RequestRefused, NodeLost, RemoteWireError."""
+async def ask(http: aiohttp.ClientSession, method: str, url: str, body: object = None) -> Any:
+    """The JSON a node answers with. body : to be sent as JSON.
+
+    Raises RequestRefused, NodeLost, NodeNotTrusted, RemoteWireError.
+    """
+    data = None if body is None else msgspec.json.encode(body)
     try:
-        async with http.request(method, url, timeout=TIMEOUT) as response:
+        async with http.request(method, url, data=data, timeout=TIMEOUT) as response:
             return reply(response.status, await bounded_body(response))
     except (aiohttp.ClientError, OSError) as error:
-        raise NodeLost(f"lost {url}: {error or 'no answer in time'}; try again once the node is back") from error
+        raise trouble(url, error) from error
 
 
 async def bounded_body(response: aiohttp.ClientResponse) -> bytes:

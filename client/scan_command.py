@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from client.arguments import add_node, node_url
+from client.arguments import add_node, chosen_node
 
 if TYPE_CHECKING:
     from client.session import Session
@@ -33,7 +33,7 @@ def run_scan(args: argparse.Namespace) -> int:
 async def _scan(args: argparse.Namespace) -> str:
     from client.session import connect
 
-    async with connect(await node_url(args), token=args.token) as session:
+    async with connect(await chosen_node(args), token=args.token) as session:
         return await _sweep(session, silent=args.json)
 
 

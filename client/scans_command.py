@@ -7,7 +7,7 @@ import json
 from datetime import datetime
 from typing import Any
 
-from client.arguments import add_node, node_url
+from client.arguments import add_node, chosen_node
 from protocol.printable import printable
 
 
@@ -31,13 +31,10 @@ def run_scans(args: argparse.Namespace) -> int:
 
 
 async def _scans(args: argparse.Namespace) -> list[dict[str, Any]]:
-    import aiohttp
-
+    from client.login import logged_in
     from client.rest import ask
 
-    url = await node_url(args)
-    headers = {"Authorization": f"Bearer {args.token}"} if args.token else {}
-    async with aiohttp.ClientSession(headers=headers) as http:
+    async with logged_in(await chosen_node(args), args.token) as (url, http):
         return _checked(await ask(http, "GET", f"{url}/v1/scans"), url)
 
 

@@ -21,6 +21,7 @@ from client.classic_model import ClassicModel
 from client.discovery import NodeAddress
 from client.errors import NodeLost
 from client.live import LiveFrame
+from client.login import logged_in
 from client.model import Model
 from client.news import News
 from client.reader import Reader, Stats
@@ -41,15 +42,18 @@ class Held(NamedTuple):
 
 
 @asynccontextmanager
-async def connect(node: NodeAddress | str, token: str | None = None) -> AsyncIterator[Session]:
-    """A session with a node, given by what `discover` found or by its URL (http://HOST:PORT).
+async def connect(
+    node: NodeAddress | str, token: str | None = None, fingerprint: str | None = None
+) -> AsyncIterator[Session]:
+    """A session with a node, given by what `discover` found or by its URL (https://HOST:PORT).
 
-    Raises NodeLost when there is none, RequestRefused when it lets nobody in, RemoteWireError when it speaks otherwise.
+    token, fingerprint : what shows us to the node, and the SHA-256 of the certificate that shows it to us; without
+    them, what `pair` or `foveascan join` has kept.
+    Raises NodeLost when there is none, NodeNotTrusted (before anything is asked) when it is another, RequestRefused
+    when it lets us not in, RemoteWireError when it speaks otherwise.
     """
-    url = node.url if isinstance(node, NodeAddress) else node.rstrip("/")
-    headers = {"Authorization": f"Bearer {token}"} if token else {}
-    async with aiohttp.ClientSession(headers=headers) as http:
-        stream, info = await open_stream(http, url, token)
+    async with logged_in(node, token, fingerprint) as (url, http):
+        stream, info = await open_stream(http, url)
         session = Session(http, stream, info)
         try:
             yield session

@@ -13,8 +13,10 @@ from typing import Any
 import aiohttp
 import msgspec
 
-from client.errors import NodeLost, RequestRefused
+from client.errors import RequestRefused
+from client.login import logged_in
 from client.model import Model
+from client.trust import trouble
 from protocol.errors import RemoteWireError
 from protocol.messages import ScanInfo
 from protocol.refinement import Refinement
@@ -51,18 +53,20 @@ class SharedViewer:
                     raise RequestRefused(f"HTTP {response.status}", body[:500].decode(errors="replace"))
                 self.hits += response.headers.get("X-Cache-Status") == "HIT"
         except (aiohttp.ClientError, OSError) as error:
-            raise NodeLost(f"lost {self._url}: {error}") from error
+            raise trouble(self._url, error) from error
         return body
 
 
 @asynccontextmanager
-async def open_shared(url: str, scan: str = "latest", codec: str = "htj2k") -> AsyncIterator[SharedViewer]:
+async def open_shared(
+    url: str, scan: str = "latest", codec: str = "htj2k", token: str | None = None
+) -> AsyncIterator[SharedViewer]:
     """A viewer of one scan of the node (or the cache before it) at url, its first view in.
 
-    Raises NodeLost, RequestRefused, RemoteWireError.
+    token : None: what pairing has kept. Raises NodeLost, NodeNotTrusted, RequestRefused, RemoteWireError.
     """
-    async with aiohttp.ClientSession() as http:
-        viewer = SharedViewer(http, url.rstrip("/"), await _described(http, url.rstrip("/"), scan))
+    async with logged_in(url, token) as (url, http):
+        viewer = SharedViewer(http, url, await _described(http, url, scan))
         place = f"{viewer._url}/v1/scans/{viewer.model.info.id}/coarse"
         for refinement in refinements_in(await viewer._body(place, {"codec": codec})):
             viewer.model.apply(refinement)
@@ -76,7 +80,7 @@ async def _described(http: aiohttp.ClientSession, url: str, scan: str) -> Model:
             if response.status != 200:
                 raise RequestRefused(f"HTTP {response.status}", body[:500].decode(errors="replace"))
     except (aiohttp.ClientError, OSError) as error:
-        raise NodeLost(f"lost {url}: {error}") from error
+        raise trouble(url, error) from error
     try:
         return Model(msgspec.json.decode(body, type=ScanInfo))
     except (msgspec.DecodeError, UnicodeError) as error:

@@ -11,6 +11,7 @@ from aiohttp import ClientWebSocketResponse, ClientWSTimeout, WSCloseCode, WSMsg
 
 from client.errors import NodeLost, RequestRefused
 from client.rest import ask
+from client.trust import UNTRUSTED, trouble
 from protocol import messages as m
 from protocol.errors import RemoteWireError
 from protocol.printable import printable
@@ -37,13 +38,13 @@ class Stream:
         self._socket = socket
         self._order = Order(Role.CLIENT)
 
-    async def greet(self, token: str | None) -> m.ServerInfo:
+    async def greet(self) -> m.ServerInfo:
         """Exchange greetings. Raises NodeLost, RequestRefused, or RemoteWireError for a node of another protocol."""
         info, _ = await self.receive()
         assert isinstance(info, m.ServerInfo)  # the order of a stream allows nothing else here
         if info.protocol != m.PROTOCOL:
             raise RemoteWireError(f"{self.url} speaks {info.protocol}, we {m.PROTOCOL}: update the older of the two")
-        await self.send(m.Hello(m.PROTOCOL, client="foveascan", token=token or ""))
+        await self.send(m.Hello(m.PROTOCOL, client="foveascan"))
         match await self.receive():
             case m.Refused(code=code, message=message), _:
                 raise RequestRefused(code, message)
@@ -86,13 +87,13 @@ class Stream:
         return NodeLost(f"lost {self.url}: {why}; connect again once the node is back")
 
 
-async def open_stream(http: aiohttp.ClientSession, url: str, token: str | None) -> tuple[Stream, m.ServerInfo]:
-    """Connect to the node at `url` and exchange greetings. Raises NodeLost, RequestRefused, RemoteWireError."""
+async def open_stream(http: aiohttp.ClientSession, url: str) -> tuple[Stream, m.ServerInfo]:
+    """Connect to the node at `url` and exchange greetings. Raises what `logged_in` and `Stream.greet` raise."""
     try:
         async with asyncio.timeout(HANDSHAKE_S):
             stream = Stream(await _connect(http, url), url)
             try:
-                return stream, await stream.greet(token)
+                return stream, await stream.greet()
             except BaseException as error:
                 await stream.close(error if isinstance(error, RemoteWireError) else None)
                 raise
@@ -109,8 +110,10 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
             heartbeat=HEARTBEAT_S,
             timeout=ClientWSTimeout(ws_close=CLOSE_S),
         )
+    except UNTRUSTED as error:  # first: some are ValueErrors too
+        raise trouble(url, error) from error
     except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, ValueError) as error:
-        raise NodeLost(f"{url!r} is no address of a node; use http://HOST:PORT") from error
+        raise NodeLost(f"{url!r} is no address of a node; use https://HOST:PORT") from error
     except aiohttp.WSServerHandshakeError as error:
         raise await _refusal(http, url, error.status) from error
     except aiohttp.ClientConnectorError as error:
@@ -133,7 +136,7 @@ def _reason(error: OSError) -> str:
 
 async def _refusal(http: aiohttp.ClientSession, url: str, status: int) -> NodeLost | RequestRefused:
     if status in (401, 403):
-        return RequestRefused("forbidden", "it wants a token; pass the one it was paired with")
+        return RequestRefused("forbidden", "it wants a token that was not revoked: pair with `foveascan join CODE`")
     if status == BUSY:
         with suppress(NodeLost, RemoteWireError):
             try:

@@ -9,8 +9,10 @@ from typing import BinaryIO
 
 import aiohttp
 
-from client.errors import NodeLost
+from client.discovery import NodeAddress
+from client.login import logged_in
 from client.rest import bounded_body, reply
+from client.trust import trouble
 from exchange.formats import suffix_of
 from exchange.whole_file import whole_file
 from protocol.errors import RemoteWireError
@@ -22,14 +24,15 @@ Moved = Callable[[int, int | None], object]
 """Told the bytes moved so far, and those in all where they are known."""
 
 
-async def fetch_scan(url: str, scan: str, path: str | Path, *, token: str | None = None, moved: Moved) -> int:
+async def fetch_scan(
+    node: NodeAddress | str, scan: str, path: str | Path, *, token: str | None = None, moved: Moved
+) -> int:
     """Write a node's scan ("latest" or an id) to a file, in the format its suffix names. Returns its size in bytes.
 
-    Raises ExchangeError for a suffix we do not know, RequestRefused, NodeLost, RemoteWireError, OSError; then the
-    file is what it was before.
+    Raises ExchangeError for a suffix we do not know, what `connect` raises, and OSError; then the file is what it was
+    before.
     """
-    address = f"{url}/v1/scans/{scan}{suffix_of(path)}"
-    async with _request("GET", address, token) as response:
+    async with _request("GET", node, f"/v1/scans/{scan}{suffix_of(path)}", token) as response:
         if response.status != 200:
             reply(response.status, await bounded_body(response))
             raise RemoteWireError(f"HTTP {response.status} without a file")
@@ -40,10 +43,10 @@ async def fetch_scan(url: str, scan: str, path: str | Path, *, token: str | None
             return file.tell()
 
 
-async def send_scan(url: str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> str:
+async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> str:
     """Add a native grid (.npz, open at its start) to a node's library. Returns the scan's id.
 
-    Raises RequestRefused, NodeLost, RemoteWireError; then the node has nothing of it.
+    Raises what `connect` raises; then the node has nothing of it.
     """
     size = file.seek(0, 2)
     file.seek(0)
@@ -54,27 +57,27 @@ async def send_scan(url: str, file: BinaryIO, *, token: str | None = None, moved
             moved(file.tell(), size)
 
     headers = {"Content-Length": str(size), "Content-Type": "application/zip"}
-    async with _request("POST", f"{url}/v1/scans", token, data=chunks(), headers=headers) as response:
+    async with _request("POST", node, "/v1/scans", token, data=chunks(), headers=headers) as response:
         said = reply(response.status, await bounded_body(response))
     if not isinstance(said, dict) or not isinstance(said.get("id"), str):
-        raise RemoteWireError(f"{url} took the scan and did not say its id")
+        raise RemoteWireError("the node took the scan and did not say its id")
     return str(said["id"])
 
 
 @asynccontextmanager
 async def _request(
     method: str,
-    url: str,
+    node: NodeAddress | str,
+    path: str,
     token: str | None,
     data: AsyncIterator[bytes] | None = None,
     headers: dict[str, str] | None = None,
 ) -> AsyncIterator[aiohttp.ClientResponse]:
-    login = {"Authorization": f"Bearer {token}"} if token else {}
     try:
         async with (
-            aiohttp.ClientSession(timeout=TIMEOUT, headers=login) as http,
-            http.request(method, url, data=data, headers=headers) as response,
+            logged_in(node, token, timeout=TIMEOUT) as (url, http),
+            http.request(method, f"{url}{path}", data=data, headers=headers) as response,
         ):
             yield response
     except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
-        raise NodeLost(f"lost {url}: {error or 'no answer in time'}; try again once the node is back") from error
+        raise trouble(node.url if isinstance(node, NodeAddress) else node, error) from error

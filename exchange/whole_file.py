@@ -8,18 +8,22 @@ import secrets
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 
 @contextmanager
-def whole_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to write, under its name only once the block has ended well. Raises OSError when it cannot be written."""
+def whole_file(path: str | Path, *, private: bool = False) -> Iterator[BinaryIO]:
+    """A file to write, under its name only once the block has ended well. Raises OSError when it cannot be written.
+
+    private : for this user's eyes only.
+    """
     target = Path(path)
     temporary = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}")
     try:
         with _named(target):
-            file = open(temporary, "x+b")
+            file = open(temporary, "x+b", opener=partial(os.open, mode=0o600 if private else 0o666))
         with file:
             yield file
             file.flush()

@@ -18,12 +18,13 @@ HEARD_S = 3.0
 
 
 class Advertisement:
-    """An announcement that stands as long as the block it is used in."""
+    """An announcement that stands as long as the block it is used in. fingerprint : of the certificate, if any."""
 
-    def __init__(self, name: str, node_id: str, host: str, port: int, *, tls: bool = False) -> None:
+    def __init__(self, name: str, node_id: str, host: str, port: int, fingerprint: str = "") -> None:
         address = ip_address(socket.getaddrinfo(host, port)[0][4][0])
         self._interfaces = _interfaces(host)
-        properties = {"proto": PROTOCOL, "id": node_id, "name": name, "state": "ready", "tls": str(int(tls))}
+        tls = {"tls": "1", "fp": fingerprint} if fingerprint else {"tls": "0"}
+        properties = {"proto": PROTOCOL, "id": node_id, "name": name, "state": "ready", **tls}
         label = name.encode()[:NAME_MAX_BYTES].decode(errors="ignore").replace(".", "-")
         self._info = ServiceInfo(
             SERVICE, f"{label}.{SERVICE}", port=port, properties=properties, server=f"foveascan-{node_id}.local.",

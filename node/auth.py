@@ -1,48 +1,150 @@
-"""Who may do what. The one place where logins stand: HTTP requests pass `admit`, streams pass `admit_stream`.
+"""Who may do what. The one place where logins stand: every request passes `Auth.admit`, streams too.
 
-So far there is one way in: a node on loopback that was started with `--insecure` lets everybody do everything.
+A login is a token (node.access), shown as `Authorization: Bearer`, as the subprotocol `foveascan.token.<token>` of a
+stream, or as a cookie that the pairing page set. Who shows none may ask what is PUBLIC and nothing else; a role that is
+more than view is asked for where the work is done, by `require`. A node with --insecure, which serves loopback only,
+lets everybody do everything.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import asyncio
+import logging
+import time
+from dataclasses import dataclass
 
 from aiohttp import web
 from aiohttp.typedefs import Handler
+from yarl import URL
 
-from node.config import Server
-from protocol.errors import ConfigError
-from protocol.messages import Hello
+from node.access import Access, Token
+from node.attempts import Attempts
+from node.config import is_loopback
+from protocol.errors import AccessError
+from protocol.pairing import Role as Role
 
-Role = Literal["view", "operate", "admin"]
-ROLE: web.RequestKey[Role] = web.RequestKey("role", str)  # type: ignore[arg-type]
-RANK = {"view": 0, "operate": 1, "admin": 2}
+log = logging.getLogger(__name__)
+
+COOKIE = "__Host-foveascan"
+SUBPROTOCOL = "foveascan.token."
+STREAM = "/v1/stream"
+PUBLIC = frozenset({"/assets/{name}", "/healthz", "/pair", "/v1/pair"})
+CHALLENGE = {"WWW-Authenticate": "Bearer"}
+SAFE = frozenset({"GET", "HEAD"})
+RANK: dict[Role | None, int] = {None: -1, "view": 0, "operate": 1, "admin": 2}
+WRONG_TOKENS, WITHIN_S = 20, 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Login:
+    """Who asks: the name given when paired, and what they may do; role None: nobody we know."""
+
+    name: str
+    role: Role | None
+    token: Token | None = None
+
+
+LOGIN: web.RequestKey[Login] = web.RequestKey("login", Login)
+NOBODY = Login("nobody", None)
+EVERYBODY = Login("anybody", "admin")
 
 
 class Auth:
-    """Decides the role of whoever asks."""
+    """Decides who asks. access : the tokens; None: no login is needed."""
 
-    def __init__(self, server: Server) -> None:
-        if not server.insecure:
-            raise ConfigError("server.insecure: logins are not there yet; start with --insecure, on loopback only")
-
-    @property
-    def needs_token(self) -> bool:
-        """Whether a client must present a token."""
-        return False
-
-    def admit_stream(self, hello: Hello) -> Role | None:
-        """Role of a client that presents itself on a stream, or None for nobody."""
-        return "admin"
+    def __init__(self, access: Access | None) -> None:
+        self._access = access
+        self._wrong = Attempts(WRONG_TOKENS, WITHIN_S)
+        self._at_work: dict[asyncio.Task[object], Login] = {}
 
     @web.middleware
     async def admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Give every HTTP request its role."""
-        request[ROLE] = "admin"
-        return await handler(request)
+        """Give every request its login, or refuse it."""
+        self._check_origin(request)
+        request[LOGIN] = login = self._identify(request)
+        route = request.match_info.route.resource
+        place = route.canonical if route else ""
+        if login.role is None and place == "/":
+            raise web.HTTPSeeOther("/pair")
+        if login.role is None and place not in PUBLIC:
+            raise web.HTTPUnauthorized(text="this node wants a login: pair with it first")
+        task = asyncio.current_task()
+        if task is None or place == STREAM:
+            return await handler(request)
+        self._at_work[task] = login
+        try:
+            return await handler(request)
+        finally:
+            del self._at_work[task]
+
+    def stands(self, login: Login) -> bool:
+        """Whether a login has not been revoked since; when that cannot be read, none stands."""
+        if self._access is None or login.token is None:
+            return True
+        try:
+            return login.token in self._access.tokens()
+        except AccessError as error:
+            log.error("%s", error)
+            return False
+
+    def expel(self) -> None:
+        """End the requests of those whose login was revoked. Streams are ended by the server, with a word of it."""
+        for task, login in self._at_work.items():
+            if not self.stands(login):
+                log.warning("ended a request of %s, whose login was revoked", login.name)
+                task.cancel()
+
+    def _identify(self, request: web.Request) -> Login:
+        if self._access is None:
+            return EVERYBODY
+        text = _token_shown(request)
+        if text is None:
+            return NOBODY
+        token = self._access.find(text)
+        if token is not None:
+            return Login(token.name, token.role, token)
+        address, now_s = request.remote or "", time.monotonic()
+        if self._wrong.is_locked(address, now_s):
+            raise web.HTTPTooManyRequests(text="too many wrong tokens: wait a minute")
+        self._wrong.failed(address, now_s)
+        log.warning("a wrong or revoked token from %s", address)
+        return NOBODY
+
+    def _check_origin(self, request: web.Request) -> None:
+        """Raises 403 for what another site's page had a browser ask."""
+        own = f"{request.scheme}://{request.host}"
+        origin = request.headers.get("Origin")
+        if origin is None and COOKIE in request.cookies and _changes(request):
+            raise web.HTTPForbidden(text="a browser says where a request comes from, and this one does not")
+        if origin is not None and origin != own:
+            raise web.HTTPForbidden(text="the request comes from the page of another site")
+        if self._access is None and not _is_loopback_name(request.host):
+            raise web.HTTPForbidden(text="without login only requests to this very machine are answered")
 
 
 def require(request: web.Request, role: Role) -> None:
     """Raise 403 unless whoever asks has at least this role."""
-    if RANK[request[ROLE]] < RANK[role]:
+    if RANK[request[LOGIN].role] < RANK[role]:
         raise web.HTTPForbidden(text=f"this needs the role {role}")
+
+
+def _token_shown(request: web.Request) -> str | None:
+    kind, _, text = request.headers.get("Authorization", "").partition(" ")
+    if kind.lower() == "bearer":
+        return text.strip()
+    for offered in request.headers.get("Sec-WebSocket-Protocol", "").split(","):
+        if offered.strip().startswith(SUBPROTOCOL):
+            return offered.strip().removeprefix(SUBPROTOCOL)
+    return request.cookies.get(COOKIE)
+
+
+def _changes(request: web.Request) -> bool:
+    return request.method not in SAFE or "Upgrade" in request.headers
+
+
+def _is_loopback_name(host: str) -> bool:
+    """Whether a Host header names this machine itself: else a page whose name leads here would be let in."""
+    try:
+        return is_loopback(URL(f"http://{host}").host or "")
+    except ValueError:
+        return False

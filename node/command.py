@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from node.access_command import add_access_commands
 from node.library_command import add_library_command
 
 ADDRESS = "the scanner's: path of a serial port, serial:VID:PID[:SERIAL] or usb:VID:PID[:SERIAL]"
@@ -13,6 +14,7 @@ ADDRESS = "the scanner's: path of a serial port, serial:VID:PID[:SERIAL] or usb:
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `serve` and `doctor`."""
     add_library_command(subparsers)
+    add_access_commands(subparsers)
     serve = subparsers.add_parser("serve", help="run the node: read the scanner, keep scans, serve clients")
     serve.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML); options here win over them")
     serve.add_argument("--library", metavar="DIR", help="folder the scans are kept in")

@@ -51,6 +51,8 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
 
     listen: Annotated[str, Meta(max_length=300)] = "127.0.0.1:7345"  # HOST:PORT or [IPv6]:PORT; port 0: any free one
     insecure: bool = False  # plain HTTP without login, on loopback only
+    certificate: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM; none: the node makes its own
+    key: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM, of the certificate
     max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
     shared_cache: bool = False  # let caches in between keep foveae, for a day at most: only where they are yours
     encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode
@@ -59,6 +61,8 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
         host, _ = _split_listen(self.listen)
         if self.insecure and not is_loopback(host):
             raise ValueError(f"insecure: without login only loopback is served, not {host}; listen on 127.0.0.1")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate: a certificate and its key come together; set both, or neither")
 
     @property
     def host(self) -> str:

@@ -17,7 +17,7 @@ from functools import partial
 
 from aiohttp import WSMsgType, web
 
-from node.auth import Auth
+from node.auth import Login
 from node.bound import Bound, updated
 from node.classic_planner import ClassicUpdate
 from node.exhibits import Exhibits
@@ -46,14 +46,14 @@ class Connection:
     def __init__(
         self,
         socket: web.WebSocketResponse,
-        auth: Auth,
+        login: Login,
         exhibits: Exhibits,
         live: Live,
         info: m.ServerInfo,
         cold_start_bytes_s: float,
     ) -> None:
         self._socket = socket
-        self._auth = auth
+        self.login = login
         self._exhibits = exhibits
         self._live = live
         self._place: Place | None = None
@@ -88,6 +88,11 @@ class Connection:
         except* (ConnectionError, TimeoutError):
             pass
 
+    @property
+    def is_ending(self) -> bool:
+        """Whether goodbye was said."""
+        return self._session.phase is Phase.CLOSED or self._socket.closed
+
     def publish(self, scan_id: str) -> None:
         """Tell the client of a new scan, when it is listening."""
         self._news.append(m.Published(scan_id))
@@ -111,15 +116,12 @@ class Connection:
         if message is None:
             return False
         assert isinstance(message, m.Hello)  # the session lets nothing else through
-        role = self._auth.admit_stream(message)
         if message.protocol != m.PROTOCOL:
             await self._send(m.Refused(0, "bad request", f"this node speaks {m.PROTOCOL}"))
             return False
-        if role is None:
-            await self._send(m.Refused(0, "forbidden", "this node needs a token"))
-            return False
         self._codecs = message.codecs
-        await self._send(m.Welcome(role))
+        assert self.login.role is not None  # Auth.admit lets nobody else come here
+        await self._send(m.Welcome(self.login.role))
         return True
 
     async def _read(self) -> None:

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from drivers.discover import config_for, open_port
+from node.access import Access, access_folder
 from node.advertise import Advertisement
 from node.capture import Capture
 from node.config import Config
@@ -25,8 +26,10 @@ from node.live import Live
 from node.notify import Notifier, keep_notified, status_text
 from node.resume import publish_complete
 from node.serve import NodeServer
+from node.tls import Tls
 from protocol import messages as m
 from protocol.grid import Grid
+from protocol.pairing import fingerprint_text
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +69,8 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
     live = Live(lambda: loop.call_soon_threadsafe(server.show_live), config.first_view.max_bytes)
     capture, announce = _capture(config, library, live)
     info = _server_info(config, folder)
-    server = NodeServer(config, info, exhibits, live, capture)
+    access, tls = await asyncio.to_thread(_entrance, config, folder, info.id)
+    server = NodeServer(config, info, exhibits, live, capture, access, tls)
     host, port = await server.start()
     stack.push_async_callback(server.stop)
     announce.append(lambda scan_id: loop.call_soon_threadsafe(server.publish, scan_id))
@@ -74,8 +78,20 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
         capture.start()
         stack.push_async_callback(asyncio.to_thread, capture.stop)
     if config.discovery.enabled:
-        await stack.enter_async_context(Advertisement(info.name, info.id, host, port))
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}", capture
+        await stack.enter_async_context(Advertisement(info.name, info.id, host, port, tls.fingerprint if tls else ""))
+    scheme, address = "https" if tls else "http", f"[{host}]" if ":" in host else host
+    return f"{scheme}://{address}:{port}", capture
+
+
+def _entrance(config: Config, library: Path, node_id: str) -> tuple[Access | None, Tls | None]:
+    """Who may come in, and what they are shown; nothing of it on a node with --insecure."""
+    if config.server.insecure:
+        log.warning("no login, no encryption: whoever has an account on this machine may do everything (--insecure)")
+        return None, None
+    folder = access_folder(library)
+    tls = Tls(config.server, folder, node_id)
+    log.info("certificate: SHA-256 %s", fingerprint_text(tls.fingerprint))
+    return Access(folder), tls
 
 
 def _keep(library: Library, grid: Grid) -> Scan:
@@ -103,4 +119,4 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:
     name = config.discovery.name or socket.gethostname()
-    return m.ServerInfo(m.PROTOCOL, node_identity(folder), name, version("foveascan"))
+    return m.ServerInfo(m.PROTOCOL, node_identity(folder), name, version("foveascan"), login=not config.server.insecure)

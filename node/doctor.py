@@ -6,12 +6,14 @@ Whether a disk takes a file is tried with one that has no name.
 
 from __future__ import annotations
 
+import datetime as dt
 import errno
 import fcntl
 import http.client
 import os
 import shutil
 import socket
+import ssl
 import stat
 import tempfile
 import time
@@ -25,6 +27,7 @@ import msgspec
 from drivers.conformance import examine_link
 from drivers.discover import config_for, find_ports, open_port
 from node import config as settings
+from node.access import FOLDER
 from node.advertise import HEARD_S, is_heard
 from node.durable import EASY_BYTES
 from node.identity import node_identity
@@ -43,7 +46,8 @@ from node.machine import (
     written_last_s,
 )
 from node.scan_folder import name_problems
-from protocol.errors import ConfigError, LibraryError, PortLost
+from node.tls import certificate_files, read_certificate
+from protocol.errors import AccessError, ConfigError, LibraryError, PortLost
 from protocol.printable import counted
 
 RULE = "70-foveascan.rules"
@@ -51,6 +55,7 @@ SWEEP_M_BYTES = 1440 * 1024 * 2 + 4096 * 2048 * 3
 SWEEP_L_BYTES = 4096 * 2048 * 2 + 8192 * 4096 * 3
 DISK_MIN_BYTES = 2 * SWEEP_L_BYTES  # a journal and the scan it becomes
 MEMORY_BASE_BYTES, MEMORY_FACTOR = 150 << 20, 6  # issue 3: 6x the arrays of a scan, and this
+ENDS_SOON = dt.timedelta(days=14)
 ANSWER_S = 2.0
 ANSWER_BYTES_MAX = 65536
 
@@ -83,6 +88,7 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     yield check_port(port, is_used=who == "node")
     yield check_permission(port, account)
     yield check_server(config.server, who)
+    yield check_certificate(config.server, library, dt.datetime.now(dt.UTC))
     yield check_disk(library, account)
     yield check_memory(available_bytes())
     yield check_clock(time.time(), written_last_s(Path(__file__), library), is_clock_synchronised())
@@ -192,6 +198,27 @@ def check_server(server: settings.Server, who: str) -> Finding:
         return Finding("server", "problem", f"{server.listen}: {error.strerror}", "correct server.listen")
 
 
+def check_certificate(server: settings.Server, library: Path, now: dt.datetime) -> Finding:
+    """Whether clients will find a certificate that is valid."""
+    if server.insecure:
+        return Finding("certificate", "warning", "none: no encryption, no logins", "remove server.insecure")
+    path, _ = certificate_files(server, library / FOLDER)
+    if server.certificate is None and not path.exists():
+        return Finding("certificate", "ok", "none yet: the node makes one when it starts")
+    try:
+        certificate = read_certificate(path)
+    except AccessError as error:
+        return Finding("certificate", "problem", str(error), "correct server.certificate, or run this as root")
+    left = certificate.not_valid_after_utc - now
+    found = f"{path}, until {certificate.not_valid_after_utc:%Y-%m-%d}"
+    cure = "renew it" if server.certificate else "restart the node, which renews its own"
+    if left <= dt.timedelta() or now < certificate.not_valid_before_utc:
+        return Finding("certificate", "problem", f"{found}: not valid now", cure)
+    if left < ENDS_SOON:
+        return Finding("certificate", "warning", f"{found}: {left.days} days are left", cure)
+    return Finding("certificate", "ok", found)
+
+
 def check_disk(folder: Path, account: Account) -> Finding:
     """Whether the library can be written, and holds another sweep of the largest size."""
     there = _nearest(folder)
@@ -291,17 +318,25 @@ def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:
     """Who listens at the node's address."""
     if server.port == 0:
         return "nobody"
-    line = http.client.HTTPConnection(server.host, server.port, timeout=ANSWER_S)
+    line = _line_to(server)
     try:
         line.request("GET", "/healthz")
         answer = msgspec.json.decode(line.getresponse().read(ANSWER_BYTES_MAX))
-        return "node" if isinstance(answer, dict) and "capture" in answer else "other"
+        return "node" if isinstance(answer, dict) and "status" in answer else "other"
     except OSError as error:
         return "other" if error.errno is None or error.errno == errno.ECONNRESET else "nobody"
     except (http.client.HTTPException, msgspec.DecodeError):
         return "other"
     finally:
         line.close()
+
+
+def _line_to(server: settings.Server) -> http.client.HTTPConnection:
+    if server.insecure:
+        return http.client.HTTPConnection(server.host, server.port, timeout=ANSWER_S)
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE  # nothing is told, and little believed
+    return http.client.HTTPSConnection(server.host, server.port, timeout=ANSWER_S, context=context)
 
 
 def _size(size_bytes: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from functools import partial
 from pathlib import Path
 
 from protocol.errors import LibraryError
@@ -17,11 +18,16 @@ class NoRoom(LibraryError):
     """The disk has no room for what was to be kept."""
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Make `data` the content of a file, or leave the file as it was. Raises OSError."""
+def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
+    """Make `data` the content of a file, or leave the file as it was. Raises OSError.
+
+    private : for the owner of its folder alone, also where root writes it.
+    """
     new = path.with_name(path.name + NEW)
     try:
-        with open(new, "wb") as file:
+        with open(new, "wb", opener=partial(os.open, mode=0o600 if private else 0o666)) as file:
+            if private:
+                give_to_owner_of(path.parent, new)
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -30,6 +36,13 @@ def write_whole(path: Path, data: bytes) -> None:
         new.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def give_to_owner_of(folder: Path, path: Path) -> None:
+    """Where root does an account's work, leave nothing behind that the account cannot use. Raises OSError."""
+    owner = folder.stat()
+    if os.geteuid() == 0 and owner.st_uid != 0:
+        os.chown(path, owner.st_uid, owner.st_gid)
 
 
 def read_bounded(path: Path, bytes_max: int) -> bytes:

@@ -24,7 +24,7 @@ from typing import BinaryIO
 import msgspec
 from aiohttp import web
 
-from node.auth import ROLE, require
+from node.auth import LOGIN, require
 from node.capture import Capture, CaptureStatus
 from node.durable import NoRoom
 from node.journal import Interrupted
@@ -37,7 +37,7 @@ from protocol.errors import LibraryError
 
 def who_asks(request: web.Request) -> str:
     """How the history calls whoever asks."""
-    return f"{request[ROLE]} at {request.remote}"
+    return f"{request[LOGIN].name} at {request.remote}"
 
 
 class LibraryRoutes:
@@ -93,7 +93,7 @@ class LibraryRoutes:
         return _json({"id": scan_id, "sound": problem is None, "reason": problem.reason if problem else ""})
 
     async def _delete(self, request: web.Request) -> web.Response:
-        require(request, "admin")
+        require(request, "operate")
         scan_id = self._named(request)
         with _explained():
             await asyncio.to_thread(self._library.delete, scan_id)
@@ -128,7 +128,7 @@ class LibraryRoutes:
         return _json(_summary(sweep), status=202)
 
     async def _delete_sweep(self, request: web.Request) -> web.Response:
-        require(request, "admin")
+        require(request, "operate")
         sweep = self._interrupted(request)
         with _explained():
             await asyncio.to_thread(self._library.sweeps.delete, sweep.id)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import time
 from dataclasses import asdict
 from typing import cast
 
@@ -12,7 +13,8 @@ import msgspec
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-from node.auth import Auth, require
+from node.access import Access
+from node.auth import CHALLENGE, LOGIN, Auth, require
 from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection
@@ -24,10 +26,12 @@ from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
 from node.live import Live
 from node.page import Page
+from node.pairing import PairingRoutes
 from node.refine_texture import CODECS
 from node.shared import SharedFoveae
+from node.tls import Tls
 from protocol import messages as m
-from protocol.errors import LibraryError
+from protocol.errors import AccessError, ConfigError, LibraryError
 
 log = logging.getLogger(__name__)
 
@@ -37,13 +41,16 @@ WRITE_LIMIT_BYTES = 16 * 1024
 HEARTBEAT_S = 20.0
 BODY_MAX_BYTES = 1 << 16
 GOODBYE_S = 1.0
+ACCESS_S = 0.5  # between looks at what other processes changed of tokens and certificate
+RENEW_S = 3600.0  # between looks at the certificate
 REQUESTS_S = 1.0  # that requests in work get to end when the node stops
 ANSWERED = web.RequestKey("answered", bool)  # the head of the answer is made
 SECURITY_HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
-    "Content-Security-Policy": "default-src 'self'",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
 }
 
 
@@ -51,19 +58,31 @@ class NodeServer:
     """The node as clients see it; everything here runs in one event loop."""
 
     def __init__(
-        self, config: Config, info: m.ServerInfo, exhibits: Exhibits, live: Live, capture: Capture | None
+        self,
+        config: Config,
+        info: m.ServerInfo,
+        exhibits: Exhibits,
+        live: Live,
+        capture: Capture | None,
+        access: Access | None = None,
+        tls: Tls | None = None,
     ) -> None:
+        if not config.server.insecure and (access is None or tls is None):
+            raise ConfigError("server.insecure: without --insecure a node needs tokens and a certificate")
         self._config = config
         self._info = info
         self._exhibits = exhibits
         self._live = live
         self._capture = capture
         self._is_stopping = False
-        self._auth = Auth(config.server)
+        self._tls = tls
+        self._auth = Auth(access)
         self._shared = SharedFoveae(exhibits, shared_cache=config.server.shared_cache)
         self._connections: dict[Connection, asyncio.Transport] = {}
-        self._app = web.Application(middlewares=[self._auth.admit, _explain], client_max_size=BODY_MAX_BYTES)
+        self._hanging_up: set[asyncio.Task[None]] = set()
+        self._app = web.Application(middlewares=[_explain, self._auth.admit], client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.append(_harden)
+        pairing = PairingRoutes(access, tls, info.id, info.name, self._expel)
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
         self._app.add_routes([
             *Page().routes(),
@@ -76,26 +95,59 @@ class NodeServer:
             web.get("/v1/stream", self._stream),
             *self._shared.routes(),
             *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
+            *pairing.routes(),
         ])  # fmt: skip
         self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=REQUESTS_S)
 
     async def start(self) -> tuple[str, int]:
         """Begin to listen. Returns the address bound. Raises OSError when it cannot be."""
         await self._runner.setup()
-        site = web.TCPSite(self._runner, self._config.server.host, self._config.server.port)
+        context = self._tls.context if self._tls else None
+        site = web.TCPSite(self._runner, self._config.server.host, self._config.server.port, ssl_context=context)
         await site.start()
+        self._watching = asyncio.create_task(self._watch_access())
         host, port = self._runner.addresses[0][:2]
         return str(host), int(port)
 
     async def stop(self) -> None:
         """Tell every client, hang up on those that do not listen, then stop listening."""
         self._is_stopping = True
+        self._watching.cancel()
         goodbyes = [asyncio.ensure_future(connection.close("the node is stopping")) for connection in self._connections]
         if goodbyes:
             await asyncio.wait(goodbyes, timeout=GOODBYE_S)
         for line in self._connections.values():
             line.abort()
         await self._runner.cleanup()
+
+    async def _watch_access(self) -> None:
+        """Notice what commands beside this process revoke, and certificates that were renewed or are due."""
+        renewed_s = time.monotonic()
+        while True:
+            await asyncio.sleep(ACCESS_S)
+            try:
+                self._expel()
+                if self._tls is not None and time.monotonic() - renewed_s > RENEW_S:
+                    renewed_s = time.monotonic()
+                    await asyncio.to_thread(self._tls.refresh)
+            except AccessError as error:
+                log.error("%s", error)
+
+    def _expel(self) -> None:
+        """End what those are doing whose login was revoked, streams with a word of it."""
+        for connection, line in self._connections.items():
+            if not self._auth.stands(connection.login) and not connection.is_ending:
+                self._hanging_up.add(task := asyncio.create_task(self._hang_up(connection, line)))
+                task.add_done_callback(self._hanging_up.discard)
+        self._auth.expel()
+
+    async def _hang_up(self, connection: Connection, line: asyncio.Transport) -> None:
+        log.warning("ended a stream of %s, whose login was revoked", connection.login.name)
+        try:
+            async with asyncio.timeout(GOODBYE_S):
+                await connection.close("the login was revoked")
+        except TimeoutError:
+            line.abort()
 
     def publish(self, scan_id: str) -> None:
         """Tell every client of a new scan."""
@@ -121,6 +173,8 @@ class NodeServer:
         else:
             health = await asyncio.to_thread(examine_health, capture, self._exhibits.library)
         status = 503 if health.status == "stopping" else 200
+        if request[LOGIN].role is None:
+            return _json({"status": health.status}, status)
         return _json({**asdict(health), "capture": asdict(capture)}, status)
 
     async def _node(self, request: web.Request) -> web.Response:
@@ -169,7 +223,7 @@ class NodeServer:
             return stream
         _bound_buffers(line)
         cold_start = self._config.planner.cold_start_bytes_s
-        connection = Connection(stream, self._auth, self._exhibits, self._live, self._info, cold_start)
+        connection = Connection(stream, request[LOGIN], self._exhibits, self._live, self._info, cold_start)
         self._connections[connection] = line
         try:
             await connection.run()
@@ -207,6 +261,7 @@ async def _harden(request: web.Request, response: web.StreamResponse) -> None:
     request[ANSWERED] = True
     for name, value in SECURITY_HEADERS.items():
         response.headers.setdefault(name, value)
+    response.headers["Server"] = "foveascan"  # instead of which Python and which library, to whoever asks
 
 
 @web.middleware
@@ -216,12 +271,17 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
         return await handler(request)
     except LibraryError as error:
         return _refusal(404, "not found", str(error))
+    except AccessError as error:
+        log.error("%s", error)
+        return _refusal(503, "service unavailable", "who may come in cannot be read")
     except web.HTTPException as error:
         if error.status < 400:
             raise
         refusal = _refusal(error.status, error.reason.lower(), _what(request, error))
         if "Allow" in error.headers:
             refusal.headers["Allow"] = error.headers["Allow"]
+        if error.status == 401:
+            refusal.headers.update(CHALLENGE)
         return refusal
     except Exception as error:
         if isinstance(error, ConnectionError) or ANSWERED in request:

@@ -10,6 +10,7 @@ FoveascanError
 │   ├── PortLost         the port or the device behind it is gone
 │   └── ScannerFault     the scanner answered, and said no
 ├── LibraryError         a scan on disk that cannot be read, written or found
+├── AccessError          who may come in: a certificate, token or code that cannot be read, written or found
 └── ConfigError          a setting with a wrong type, an unknown key or a value out of bounds (also a ValueError)
 """
 
@@ -52,6 +53,10 @@ class ScannerFault(DriverError):
 
 class LibraryError(FoveascanError):
     """A scan on disk that cannot be read, written or found."""
+
+
+class AccessError(FoveascanError):
+    """A certificate, a token or a pairing code that cannot be read, written or found."""
 
 
 class ConfigError(FoveascanError, ValueError):

@@ -141,7 +141,7 @@ class ClassicLookParameters(_Part, frozen=True):
 
 
 class ServerInfo(_Message, frozen=True):
-    """First message of a stream: who speaks, which version, and whether a token is needed."""
+    """First message of a stream: who speaks, which version, and whether a login is needed."""
 
     protocol: ShortText
     id: ShortText
@@ -253,7 +253,6 @@ class Hello(_Message, frozen=True):
 
     protocol: ShortText
     client: ShortText = ""
-    token: ShortText = ""
     codecs: Annotated[tuple[CodecName, ...], Meta(min_length=1, max_length=8)] = ("htj2k", "jpeg")
 
 

@@ -170,6 +170,7 @@ class Line:
 
     socket: web.WebSocketResponse
     session: Session
+    authorization: str | None = None  # what the client showed
 
     async def say(self, *said: m.FromNode | Refinement | LiveColumns) -> None:
         for one in said:
@@ -230,7 +231,7 @@ async def serving(script: Script, *routes: web.RouteDef) -> AsyncIterator[str]:
         socket = web.WebSocketResponse(protocols=(m.PROTOCOL,))
         await socket.prepare(request)
         try:
-            await script(Line(socket, Session(Role.NODE)))
+            await script(Line(socket, Session(Role.NODE), request.headers.get("Authorization")))
         except ConnectionError:
             pass
         except BaseException as error:

@@ -62,7 +62,7 @@ def test_discover_prints_every_node(nodes: list[NodeAddress], capsys: pytest.Cap
     assert run("discover", "--json") == 0
     url = "http://127.0.0.1:7345"
     assert json_lines(capsys.readouterr().out) == [
-        {"name": "one", "id": "id-one", "state": "ready", "url": url, "tls": False}
+        {"name": "one", "id": "id-one", "state": "ready", "url": url, "tls": False, "fingerprint": ""}
     ]
 
 

@@ -668,11 +668,12 @@ async def test_a_client_may_connect_to_what_discovery_found() -> None:
             assert (await session.open()).info.id == "synthetic"
 
 
-async def test_a_token_is_presented_in_hello_and_in_http() -> None:
+async def test_a_token_is_presented_with_the_stream_and_in_http() -> None:
     heard: list[str | None] = []
 
     async def script(line: Line) -> None:
-        heard.append((await greet(line)).token)
+        heard.append(line.authorization)
+        await greet(line)
         await until_gone(line)
 
     async def scans(request: web.Request) -> web.Response:
@@ -681,7 +682,7 @@ async def test_a_token_is_presented_in_hello_and_in_http() -> None:
 
     async with serving(script, web.get("/v1/scans", scans)) as url, connect(url, token="secret") as session:
         assert await session.scans() == []
-    assert heard == ["secret", "Bearer secret"]
+    assert heard == ["Bearer secret", "Bearer secret"]
 
 
 # Nobody there, or nobody who lets us in
@@ -695,7 +696,7 @@ async def test_nobody_listening_is_one_error_with_its_cure() -> None:
 
 @pytest.mark.parametrize("url", ["", "nonsense", "ftp://127.0.0.1:9", "http://", "http://127.0.0.1:99999"])
 async def test_what_is_no_url_is_named(url: str) -> None:
-    with pytest.raises(NodeLost, match="http://HOST:PORT"):
+    with pytest.raises(NodeLost, match="https://HOST:PORT"):
         async with connect(url):
             pass
 

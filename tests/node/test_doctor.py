@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import datetime as dt
 import fcntl
 import json
 import os
@@ -18,10 +19,12 @@ import pytest
 import foveascan
 from node import config as settings
 from node import doctor, machine
+from node.access import access_folder
 from node.doctor import Finding
 from node.durable import EASY_BYTES
 from node.library import About, Library
 from node.machine import Account
+from node.tls import renew_own
 from protocol.grid import Grid, GridSpec
 
 ROOT = Account("root", 0, frozenset({0}))
@@ -53,7 +56,8 @@ def test_a_wrong_setting_is_named_and_ends_the_examination(tmp_path: Path) -> No
 def test_every_check_has_its_say(tmp_path: Path) -> None:
     findings = list(doctor.examine(None, {"library.folder": str(tmp_path), "server.listen": "127.0.0.1:0"}))
     assert [finding.check for finding in findings] == [
-        "configuration", "port", "permission", "server", "disk", "memory", "clock", "discovery", "library",
+        "configuration", "port", "permission", "server", "certificate", "disk", "memory", "clock", "discovery",
+        "library",
     ]  # fmt: skip
     assert all(finding.cure for finding in findings if finding.state != "ok")
 
@@ -147,7 +151,7 @@ def test_root_examines_for_the_services_account(monkeypatch: pytest.MonkeyPatch)
 
 
 def server(port: int) -> settings.Server:
-    return settings.Server(listen=f"127.0.0.1:{port}")
+    return settings.Server(listen=f"127.0.0.1:{port}", insecure=True)
 
 
 def answering(body: bytes) -> HTTPServer:
@@ -292,3 +296,20 @@ def test_the_command_prints_a_line_a_check_and_fails_where_there_is_a_problem(
     records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {"check", "state", "found", "cure"} == set(records[0])
     assert {record["check"]: record["state"] for record in records}["port"] == "problem"
+
+
+# Certificate
+
+
+def test_a_certificate_is_judged_by_the_days_it_has_left(tmp_path: Path) -> None:
+    now = dt.datetime(2026, 11, 22, tzinfo=dt.UTC)
+    secure = settings.Server()
+    found = [doctor.check_certificate(settings.Server(insecure=True), tmp_path, now)]
+    found.append(doctor.check_certificate(secure, tmp_path, now))
+    renew_own(access_folder(tmp_path), "1234", "127.0.0.1", now)
+    for days in (0, 790, 800, -400):
+        found.append(doctor.check_certificate(secure, tmp_path, now + dt.timedelta(days=days)))
+    assert states(*found) == ["warning", "ok", "ok", "warning", "problem", "problem"]
+    assert states(doctor.check_certificate(settings.Server(certificate="/nowhere", key="/nowhere"), tmp_path, now)) == [
+        "problem"
+    ]

@@ -17,7 +17,7 @@ from aiohttp.typedefs import Handler
 
 from exchange.native import read_native, write_native
 from node import exchange_routes
-from node.auth import ROLE, Role
+from node.auth import LOGIN, Login, Role
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.library import About, Library, content_id
@@ -34,7 +34,7 @@ async def serving(folder: Path, role: Role = "operate") -> AsyncIterator[tuple[C
 
     @web.middleware
     async def admit(request: web.Request, handler: Handler) -> web.StreamResponse:
-        request[ROLE] = role
+        request[LOGIN] = Login("somebody", role)
         try:
             return await handler(request)
         except LibraryError as problem:

@@ -10,7 +10,7 @@ from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
 from node import durable
-from node.auth import ROLE, Role
+from node.auth import LOGIN, Login, Role
 from node.capture import CaptureStatus
 from node.library import About, Library
 from node.library_routes import LibraryRoutes
@@ -53,7 +53,7 @@ class Bench:
 
     @web.middleware
     async def admit(self, request: web.Request, handler: Any) -> web.StreamResponse:
-        request[ROLE] = self.role
+        request[LOGIN] = Login("somebody", self.role)
         response: web.StreamResponse = await handler(request)
         return response
 
@@ -79,7 +79,7 @@ async def test_what_is_said_of_a_scan_is_read_and_changed(bench: Bench, client: 
     assert (changed.status, changed.headers["ETag"]) == (200, '"1"')
     said = await (await client.get(path)).json()
     assert (said["name"], said["pins"]) == ("knee", [{"u": 0.5, "v": 0.25, "label": ""}])
-    assert said["history"][0]["by"] == "admin at 127.0.0.1"
+    assert said["history"][0]["by"] == "somebody at 127.0.0.1"
     assert bench.library.summary(bench.scan).about.name == "knee"
 
 
@@ -199,9 +199,9 @@ async def test_a_full_disk_is_told_as_such(bench: Bench, client: Client, monkeyp
     [
         ("PATCH", "/v1/scans/{scan}/sidecar", "view"),
         ("POST", "/v1/scans/{scan}/verify", "view"),
-        ("DELETE", "/v1/scans/{scan}", "operate"),
+        ("DELETE", "/v1/scans/{scan}", "view"),
         ("POST", "/v1/sweeps/{sweep}/resume", "view"),
-        ("DELETE", "/v1/sweeps/{sweep}", "operate"),
+        ("DELETE", "/v1/sweeps/{sweep}", "view"),
     ],
 )
 async def test_who_may_not_is_refused(bench: Bench, client: Client, method: str, path: str, role: Role) -> None:

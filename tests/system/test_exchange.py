@@ -20,7 +20,7 @@ from exchange.errors import ExchangeError
 from exchange.formats import read_scan
 from exchange.native import write_native
 from exchange.whole_file import whole_file
-from node.auth import ROLE
+from node.auth import LOGIN, Login
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.library import About, Library
@@ -48,7 +48,7 @@ def node(folder: Path) -> Iterator[tuple[str, Library]]:
 
     @web.middleware
     async def admit(request: web.Request, handler: Handler) -> web.StreamResponse:
-        request[ROLE] = "admin"
+        request[LOGIN] = Login("somebody", "admin")
         return await handler(request)
 
     async def serve(stop: asyncio.Event) -> None:

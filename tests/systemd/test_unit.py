@@ -19,7 +19,8 @@ SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "foveascan.service"
 PROGRAM = "/opt/foveascan/bin/foveascan"
 EXPOSURE_MAX = 1.5
-OPTIONAL = {"capture.scanner", "discovery.name"}  # nothing by default: the file shows an example
+# Nothing by default: the file shows an example.
+OPTIONAL = {"capture.scanner", "discovery.name", "server.certificate", "server.key"}
 
 
 def tool(name: str) -> str:
@@ -96,7 +97,7 @@ def test_folders_are_made_as_written(tmp_path: Path) -> None:
 def test_the_settings_file_is_accepted_as_it_is() -> None:
     config = load_config(SYSTEMD / "node.toml")
     assert str(config.library.path) == "/var/lib/" + settings()["StateDirectory"][0]
-    assert config.server.insecure and config.server.host == "127.0.0.1"
+    assert not config.server.insecure and config.server.host == "127.0.0.1"
 
 
 def test_the_settings_file_shows_every_setting_with_its_default() -> None:
@@ -109,4 +110,4 @@ def test_the_settings_file_shows_every_setting_with_its_default() -> None:
         for key, value in keys.items():
             place = f"{section}.{key}"
             assert place in changed | OPTIONAL or shown[section][key] == value, place
-    assert changed == {"server.insecure", "library.folder"}
+    assert changed == {"library.folder"}

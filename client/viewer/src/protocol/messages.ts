@@ -70,7 +70,7 @@ export interface Look {
 }
 
 export type FromClient =
-  | { type: 'hello'; protocol: string; client: string; token?: string; codecs: string[] }
+  | { type: 'hello'; protocol: string; client: string; codecs: string[] }
   | { type: 'open'; request: number; scan: string; holdings?: Statement }
   | Look
   | { type: 'ack'; epoch: number; nextSeq: number; digest: string; applyMs: number }

@@ -1,0 +1,124 @@
+"""`foveascan pair` and `foveascan access`: letting clients in, on the node's machine. Both work while the node runs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from node.access import Access
+    from node.config import Config
+
+ROLES = ("view", "operate", "admin")
+
+
+def add_access_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Offer `pair` and `access`."""
+    pair = subparsers.add_parser("pair", help="print a code that lets one client in, on the node's machine")
+    pair.add_argument("--name", required=True, help="what the client is to be called: who or where it is")
+    pair.add_argument("--role", choices=ROLES, default="view", help="look; also sweep and change; also pair (view)")
+    pair.add_argument("--minutes", type=_minutes, default=10.0, metavar="M", help="how long the code is valid (10)")
+    _add_common(pair)
+    pair.set_defaults(run=run_pair)
+
+    access = subparsers.add_parser("access", help="list who is paired, and revoke")
+    actions = access.add_subparsers(title="actions", metavar="ACTION", required=True)
+    listing = actions.add_parser("list", help="who is paired, oldest first")
+    _add_common(listing)
+    listing.set_defaults(run=run_list)
+    revoke = actions.add_parser("revoke", help="end a login, with what it is doing at this moment")
+    revoke.add_argument("name", help="what it was paired as")
+    _add_common(revoke)
+    revoke.set_defaults(run=run_revoke)
+
+
+def run_pair(args: argparse.Namespace) -> int:
+    """Print a code and the certificate's fingerprint."""
+    import time
+
+    from node.access import access_folder
+    from node.tls import certificate_files, certificate_fingerprint
+    from protocol.errors import AccessError
+    from protocol.pairing import fingerprint_text
+
+    config = _config(args)
+    certificate, _ = certificate_files(config.server, access_folder(_library(config)))
+    if not certificate.exists():
+        raise AccessError("there is no certificate yet: start the node once, without --insecure")
+    shown = certificate_fingerprint(certificate)
+    code = _access(config).offer(args.role, args.name, time.time(), 60 * args.minutes)
+    said = {"code": code, "fingerprint": shown, "name": args.name, "role": args.role, "minutes": args.minutes}
+    lines = [
+        f"code         {code}   for {args.name}, role {args.role}, valid {args.minutes:g} minutes, once",
+        f"fingerprint  {fingerprint_text(shown)}",
+        f"In Python or a shell there: foveascan join {code}",
+        "In a browser: open the node's address, compare the fingerprint with what the browser shows, type the code.",
+    ]
+    print(json.dumps(said) if args.json else "\n".join(lines), flush=True)
+    return 0
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print every login."""
+    tokens = _access(_config(args)).tokens()
+    if args.json:
+        said = [{"name": token.name, "role": token.role, "created": token.created_unix_s} for token in tokens]
+        print(json.dumps({"tokens": said}))
+        return 0
+    for token in tokens:
+        paired = datetime.fromtimestamp(token.created_unix_s).isoformat(" ", "minutes")
+        print(f"{paired}  {token.role:8} {token.name}")
+    if not tokens:
+        print("nobody is paired")
+    return 0
+
+
+def run_revoke(args: argparse.Namespace) -> int:
+    """End a login."""
+    from protocol.errors import AccessError
+
+    if not _access(_config(args)).revoke(args.name):
+        raise AccessError(f"nobody called {args.name!r} is paired: see foveascan access list")
+    print(json.dumps({"revoked": args.name}) if args.json else f"{args.name} is out")
+    return 0
+
+
+def _config(args: argparse.Namespace) -> Config:
+    from node.config import load_config
+
+    return load_config(args.config, {"library.folder": args.library})
+
+
+def _library(config: Config) -> Path:
+    """The library's folder. Raises AccessError where no node has run: its account would not own what we make."""
+    from protocol.errors import AccessError
+
+    folder = config.library.path
+    if not folder.is_dir():
+        raise AccessError(f"{folder} is no library: start the node once, or name it with --config or --library")
+    return folder
+
+
+def _access(config: Config) -> Access:
+    from node.access import Access, access_folder
+
+    return Access(access_folder(_library(config)))
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, metavar="FILE", help="the node's settings (TOML)")
+    parser.add_argument("--library", metavar="DIR", help="the node's library; wins over the settings")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        minutes = 0.0
+    if not 0 < minutes <= 60:
+        raise argparse.ArgumentTypeError(f"expected minutes above 0, up to 60, got {text!r}")
+    return minutes

@@ -1,0 +1,219 @@
+"""Letting clients in, and out again, over HTTP.
+
+    GET    /pair               a page for browsers: type the code, get a cookie
+    POST   /v1/pair            a client proves a code and gets a token; that page's form sends the code itself
+    POST   /v1/codes           (admin) a new code
+    GET    /v1/tokens          (admin) who is paired
+    DELETE /v1/tokens/{name}   (admin) revoke
+
+Guessing is hopeless (80 bits) and still stopped: an address that fails ADDRESS_FAILURES times waits, and CODE_FAILURES
+failures, wherever from, void every code that waits. Then somebody at the node makes a new one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import html
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+from aiohttp import web
+
+from node.access import Access, Token
+from node.attempts import Attempts
+from node.auth import COOKIE, LOGIN, require
+from node.tls import Tls
+from protocol import pairing
+from protocol.errors import AccessError, LocalWireError
+
+log = logging.getLogger(__name__)
+
+ADDRESS_FAILURES, WITHIN_S = 5, 300.0
+CODE_FAILURES = 20
+COOKIE_S = 400 * 86400  # browsers keep none longer
+BODY_MAX_BYTES = 4096
+REFUSED = "no such code waits: it is wrong, used, expired, or came through somebody in between; make a new one"
+LOCKED = "too many wrong codes from there: wait five minutes"
+NO_LOGIN = "this node was started with --insecure and knows no logins"
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>Pair with {name}</title>
+<style>body{{font:1rem/1.5 system-ui;max-width:36rem;margin:3rem auto;padding:0 1rem;color-scheme:light dark}}
+code{{overflow-wrap:anywhere}}input,button{{font:inherit;padding:.5rem}}input{{width:100%;box-sizing:border-box}}
+[role=alert]{{border-left:.3rem solid #b00020;padding-left:.8rem}}</style></head><body>
+<h1>Pair with {name}</h1>
+{trouble}<p>On the node's machine, <code>foveascan pair --role view --name NAME</code> prints a code and a
+fingerprint.</p>
+<ol><li>Open your browser's certificate view (the sign left of the address). Its SHA-256 fingerprint must be the one
+that was <em>printed there</em>. If it is another, somebody is in between: stop. The node says<br>
+<code>{fingerprint}</code></li>
+<li><form method="post" action="/v1/pair"><label>The code <input name="code" autocomplete="off" required autofocus
+autocapitalize="characters" spellcheck="false" maxlength="40" placeholder="ABCD-EFGH-IJKL-MNOP"></label>
+<p><button>Pair this browser</button></p></form></li></ol></body></html>
+"""
+
+
+class NewCode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of POST /v1/codes."""
+
+    name: pairing.Name
+    role: pairing.Role = "view"
+
+
+class PairingRoutes:
+    """The routes above. access, tls : None without login. revoked : called after a token was revoked."""
+
+    def __init__(
+        self, access: Access | None, tls: Tls | None, node_id: str, name: str, revoked: Callable[[], object]
+    ) -> None:
+        self._access = access
+        self._tls = tls
+        self._node_id = node_id
+        self._name = name
+        self._revoked = revoked
+        self._failures = Attempts(ADDRESS_FAILURES, WITHIN_S)
+        self._wrong_codes = 0
+
+    def routes(self) -> list[web.RouteDef]:
+        """What to add to the application."""
+        return [
+            web.get("/pair", self._page),
+            web.post("/v1/pair", self._pair),
+            web.post("/v1/codes", self._offer),
+            web.get("/v1/tokens", self._tokens),
+            web.delete("/v1/tokens/{name}", self._revoke),
+        ]
+
+    # -- pairing ---------------------------------------------------------------------------------------------------
+
+    async def _page(self, request: web.Request) -> web.Response:
+        self._known()
+        return self._show()
+
+    async def _pair(self, request: web.Request) -> web.StreamResponse:
+        access, tls = self._known()
+        body = await _bounded(request)
+        by_form = request.content_type == "application/x-www-form-urlencoded"
+        if self._failures.is_locked(request.remote or "", time.monotonic()):
+            log.warning("pairing: %s is locked", request.remote)
+            return self._show(LOCKED, 429) if by_form else _refusal(429, LOCKED)
+        return await (self._pair_browser(request, access) if by_form else self._pair_client(request, access, tls, body))
+
+    async def _pair_client(self, request: web.Request, access: Access, tls: Tls, body: bytes) -> web.Response:
+        asked = _decoded(body, pairing.PairRequest)
+        own = tls.fingerprint
+
+        def is_proven(key: bytes) -> bool:
+            return hmac.compare_digest(pairing.client_proof(key, own, asked.nonce), asked.proof)
+
+        made = await asyncio.to_thread(access.redeem, is_proven, time.time())
+        if made is None:
+            await self._failed(request, access)
+            return _refusal(403, REFUSED)
+        text, token, key = made
+        self._paired(request, token)
+        proof = pairing.node_proof(key, own, asked.nonce, text, token.role)
+        return _json(pairing.Paired(text, token.name, token.role, self._node_id, proof))
+
+    async def _pair_browser(self, request: web.Request, access: Access) -> web.Response:
+        form = await request.post()
+        try:
+            typed = pairing.key_of(pairing.parse_code(str(form.get("code", ""))))
+        except LocalWireError as error:
+            return self._show(str(error), 400)
+        made = await asyncio.to_thread(access.redeem, lambda key: hmac.compare_digest(key, typed), time.time())
+        if made is None:
+            await self._failed(request, access)
+            return self._show(REFUSED, 403)
+        text, token, _ = made
+        self._paired(request, token)
+        response = web.Response(status=303, headers={"Location": "/"})
+        response.set_cookie(COOKIE, text, max_age=COOKIE_S, path="/", secure=True, httponly=True, samesite="Strict")
+        return response
+
+    async def _failed(self, request: web.Request, access: Access) -> None:
+        self._failures.failed(request.remote or "", time.monotonic())
+        self._wrong_codes += 1
+        log.warning("pairing: a wrong code from %s", request.remote)
+        if self._wrong_codes >= CODE_FAILURES:
+            self._wrong_codes = 0
+            voided = await asyncio.to_thread(access.void_codes)
+            log.warning("pairing: %d wrong codes; %d that waited are void now", CODE_FAILURES, voided)
+
+    def _paired(self, request: web.Request, token: Token) -> None:
+        self._wrong_codes = 0
+        log.warning("pairing: %s paired from %s with the role %s", token.name, request.remote, token.role)
+
+    def _show(self, trouble: str = "", status: int = 200) -> web.Response:
+        _, tls = self._known()
+        page = PAGE.format(
+            name=html.escape(self._name),
+            trouble=f'<p role="alert">{html.escape(trouble)}</p>\n' if trouble else "",
+            fingerprint=pairing.fingerprint_text(tls.fingerprint),
+        )
+        headers = {"Content-Security-Policy": POLICY}
+        return web.Response(text=page, status=status, content_type="text/html", headers=headers)
+
+    # -- looking after it ------------------------------------------------------------------------------------------
+
+    async def _offer(self, request: web.Request) -> web.Response:
+        require(request, "admin")
+        access, tls = self._known()
+        asked = _decoded(await _bounded(request), NewCode)
+        try:
+            code = await asyncio.to_thread(access.offer, asked.role, asked.name, time.time())
+        except AccessError as error:
+            raise web.HTTPConflict(text=str(error)) from error
+        log.warning("pairing: %s offers a code for %s with the role %s", request[LOGIN].name, asked.name, asked.role)
+        return _json({"code": code, "fingerprint": tls.fingerprint}, 201)
+
+    async def _tokens(self, request: web.Request) -> web.Response:
+        require(request, "admin")
+        access, _ = self._known()
+        return _json([{"name": t.name, "role": t.role, "created": t.created_unix_s} for t in access.tokens()])
+
+    async def _revoke(self, request: web.Request) -> web.Response:
+        require(request, "admin")
+        access, _ = self._known()
+        name = request.match_info["name"]
+        if not await asyncio.to_thread(access.revoke, name):
+            raise web.HTTPNotFound(text="nobody of that name is paired")
+        log.warning("pairing: %s revoked %s", request[LOGIN].name, name)
+        self._revoked()
+        return web.Response(status=204)
+
+    def _known(self) -> tuple[Access, Tls]:
+        if self._access is None or self._tls is None:
+            raise web.HTTPConflict(text=NO_LOGIN)
+        return self._access, self._tls
+
+
+async def _bounded(request: web.Request) -> bytes:
+    """The body, kept by the request for whoever reads it again. Raises 413."""
+    if (request.content_length or 0) > BODY_MAX_BYTES:
+        raise web.HTTPRequestEntityTooLarge(BODY_MAX_BYTES, request.content_length or 0)
+    body = await request.read()
+    if len(body) > BODY_MAX_BYTES:
+        raise web.HTTPRequestEntityTooLarge(BODY_MAX_BYTES, len(body))
+    return body
+
+
+def _decoded(body: bytes, kind: type[Any]) -> Any:
+    try:
+        return msgspec.json.decode(body, type=kind)
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise web.HTTPBadRequest(text=str(error)) from None
+
+
+def _json(value: object, status: int = 200) -> web.Response:
+    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
+
+
+def _refusal(status: int, why: str) -> web.Response:
+    code = {403: "forbidden", 429: "too many requests"}[status]
+    return _json({"code": code, "message": why}, status)
