@@ -7,9 +7,13 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from client.arguments import add_node, chosen_node
+from protocol.printable import printable
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from client.session import Session
+    from protocol.messages import ScanQuality
 
 POLL_S = 0.2
 
@@ -22,19 +26,34 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
 
 
 def run_scan(args: argparse.Namespace) -> int:
-    """Sweep once; print the new scan's id."""
+    """Sweep once; print the new scan's id and quality."""
     import asyncio
 
-    scan = asyncio.run(_scan(args))
-    print(json.dumps({"scan": scan}) if args.json else f"scan {scan}", flush=True)
+    from msgspec.structs import asdict
+
+    scan, quality = asyncio.run(_scan(args))
+    if args.json:
+        print(json.dumps({"scan": scan, "quality": asdict(quality) if quality else None}), flush=True)
+        return 0
+    print(f"scan {scan}", flush=True)
+    for line in _in_words(quality) if quality else ():
+        print(line, flush=True)
     return 0
 
 
-async def _scan(args: argparse.Namespace) -> str:
+def _in_words(quality: ScanQuality) -> Iterator[str]:
+    """What a person should know of a scan, a line each."""
+    noise = "" if quality.noise_mm is None else f", noise {quality.noise_mm:.3g} mm"
+    yield f"coverage {100 * quality.coverage:.1f} %{noise}, {quality.holes} void cells in holes"
+    yield from (printable(complaint) for complaint in quality.complaints)
+
+
+async def _scan(args: argparse.Namespace) -> tuple[str, ScanQuality | None]:
     from client.session import connect
 
     async with connect(await chosen_node(args), token=args.token) as session:
-        return await _sweep(session, silent=args.json)
+        scan = await _sweep(session, silent=args.json)
+        return scan, await session.quality(scan)
 
 
 async def _sweep(session: Session, *, silent: bool) -> str:

@@ -61,6 +61,12 @@ async def connect(
             await session.close()
 
 
+class _Assessed(msgspec.Struct):
+    """What is read of GET /v1/scans/{id}; a node of an earlier version says no quality."""
+
+    quality: m.ScanQuality | None = None
+
+
 class Session:
     """See `connect`. node : who answers."""
 
@@ -212,6 +218,14 @@ class Session:
     async def scans(self) -> list[dict[str, Any]]:
         """The scans in the node's library, newest first, as GET /v1/scans describes them."""
         return list(await ask(self._http, "GET", f"{self._stream.url}/v1/scans"))
+
+    async def quality(self, scan: str) -> m.ScanQuality | None:
+        """What a scan is worth; None of one that came as a file. scan : an id or "latest"."""
+        said = await ask(self._http, "GET", f"{self._stream.url}/v1/scans/{scan}")
+        try:
+            return msgspec.convert(said, _Assessed).quality
+        except msgspec.ValidationError as problem:
+            raise RemoteWireError(f"{self._stream.url} describes the quality of scan {scan}: {problem}") from None
 
     async def scanner(self) -> dict[str, Any]:
         """What the node's scanner is doing, as GET /v1/node says under "capture": phase, progress, sweeps, why."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from node.laps import OUTLIER_SIGMAS, average, difference_sigma, shift_between
-from node.repair import repair
+from node.repair import Repaired, repair
 from node.scan_quality import ScanQuality, coverage_of, slip_matters, survey
 from protocol.errors import FoveascanError, RemoteWireError
 from protocol.grid import VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray, StepArray
@@ -144,10 +144,16 @@ class Assembler:
         """The sweep as a grid of equal angles, averaged where it was seen more than once. Raises IncompleteTurn."""
         return self._average()[0]
 
-    def assembly(self) -> Assembly:
-        """The grid without spikes and small holes, and what there is to say about it. Raises IncompleteTurn."""
+    def assembly(self, *, repairs: bool = True) -> Assembly:
+        """The grid, and what there is to say about it. Raises IncompleteTurn.
+
+        repairs : take spikes out and fill small holes; without, every sample is one that was measured.
+        """
         grid, quality = self._average()
-        repaired = repair(grid, quality.noise_mm or 0.0)
+        if repairs:
+            repaired = repair(grid, quality.noise_mm or 0.0)
+        else:
+            repaired = Repaired(grid, np.zeros(grid.range_steps.shape, np.bool_), 0)
         found = survey(repaired.grid)
         filled = int(repaired.filled.sum())
         return Assembly(

@@ -26,11 +26,11 @@ from drivers.scanner import (
     SweepReport,
     SweepStarted,
 )
+from node.assemble import Assembly
 from node.journal import Journals
 from node.resume import cut_lately, publish, resumed
 from node.running_sweep import RunningSweep
 from protocol.errors import DriverError, FoveascanError, LibraryError, PortLost
-from protocol.grid import Grid
 from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepRequest, TextureColumn
 
 log = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ class Capture:
     """Runs sweeps in a thread of its own.
 
     open_port : opens the port, raising PortLost.
-    deliver : takes each finished grid, in the capture thread, and returns once it is durable.
+    deliver : takes each finished grid with its quality, in the capture thread, and returns once it is durable.
     watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
     SweepInterrupted for it, whatever the scanner said.
     sweeps : where columns are kept until their grid is delivered; without it, a cut sweep is lost.
@@ -92,7 +92,7 @@ class Capture:
         self,
         open_port: Callable[[], Port],
         config: ScannerConfig,
-        deliver: Callable[[Grid], None],
+        deliver: Callable[[Assembly], None],
         watch: Callable[[SweepEvent], None] = lambda event: None,
         sweeps: Journals | None = None,
     ) -> None:

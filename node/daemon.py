@@ -17,6 +17,7 @@ from pathlib import Path
 from drivers.discover import config_for, open_port
 from node.access import Access, access_folder
 from node.advertise import Advertisement
+from node.assemble import Assembly
 from node.capture import Capture
 from node.config import Config
 from node.exhibits import Exhibits
@@ -28,7 +29,6 @@ from node.resume import publish_complete
 from node.serve import NodeServer
 from node.tls import Tls
 from protocol import messages as m
-from protocol.grid import Grid
 from protocol.pairing import fingerprint_text
 
 log = logging.getLogger(__name__)
@@ -94,8 +94,8 @@ def _entrance(config: Config, library: Path, node_id: str) -> tuple[Access | Non
     return Access(folder), tls
 
 
-def _keep(library: Library, grid: Grid) -> Scan:
-    return library.add(grid, About(time.time()))
+def _keep(library: Library, assembly: Assembly) -> Scan:
+    return library.add(assembly.grid, About(time.time(), quality=assembly.quality))
 
 
 def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | None, list[Callable[[str], object]]]:
@@ -105,9 +105,11 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
     if address is None:
         return None, announce
 
-    def deliver(grid: Grid) -> None:
-        scan = _keep(library, grid)
-        log.info("scan published: %d x %d", grid.spec.width, grid.spec.height)
+    def deliver(assembly: Assembly) -> None:
+        scan = _keep(library, assembly)
+        log.info("scan published: %d x %d", scan.spec.width, scan.spec.height)
+        for complaint in assembly.quality.complaints:
+            log.warning("scan: %s", complaint)
         live.published(scan.id)
         for tell in announce:
             tell(scan.id)

@@ -13,10 +13,9 @@ from dataclasses import replace
 
 from drivers.ledger import Ledger
 from drivers.scanner import Scanner, SweepEvent, SweepFinished, SweepInterrupted, SweepReport, SweepStarted
-from node.assemble import Assembler, Encoder
+from node.assemble import Assembler, Assembly, Encoder
 from node.journal import Interrupted, Journals
 from protocol.errors import FoveascanError, ScannerFault
-from protocol.grid import Grid
 from protocol.scanner_messages import (
     Column,
     DeviceInfo,
@@ -27,6 +26,7 @@ from protocol.scanner_messages import (
 )
 
 RESUME_WITHIN_S = 30.0  # a cut sweep goes on by itself this soon; later, whoever stood on the table may have left it
+REPAIRS = False  # a scan keeps no mask of what was filled, so nothing is: every sample of it was measured
 STOPPED = "stopped"  # how drivers.sweep calls the end that we asked for
 
 
@@ -68,7 +68,7 @@ def cut_lately(sweeps: Sequence[Interrupted], info: DeviceInfo, now_unix_s: floa
     return None
 
 
-def publish_complete(sweeps: Journals, deliver: Callable[[Grid], object]) -> list[str]:
+def publish_complete(sweeps: Journals, deliver: Callable[[Assembly], object]) -> list[str]:
     """Make scans of the complete sweeps that a crash kept from becoming ones. Returns what was done, or went wrong."""
     said = []
     for sweep in filter(lambda sweep: sweep.is_complete, sweeps.interrupted()):
@@ -80,12 +80,12 @@ def publish_complete(sweeps: Journals, deliver: Callable[[Grid], object]) -> lis
     return said
 
 
-def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Grid], object]) -> None:
+def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Assembly], object]) -> None:
     """Make a scan of one complete sweep. deliver : returns once it is durable. Raises FoveascanError, ValueError."""
     assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
     for column in sweeps.columns(sweep.id):
         add_column(assembler, column)
-    deliver(assembler.finish())
+    deliver(assembler.assembly(repairs=REPAIRS))
     sweeps.delete(sweep.id)
 
 

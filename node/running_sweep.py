@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from drivers.scanner import SweepReport
-from node.assemble import Assembler
+from node.assemble import Assembler, Assembly
 from node.journal import Journal, Journals
-from node.resume import add_column, encoder_of
+from node.resume import REPAIRS, add_column, encoder_of
 from protocol.errors import RemoteWireError, ScannerFault
-from protocol.grid import Grid
 from protocol.scanner_messages import Column, DeviceInfo, Outcome, SweepEnd, SweepHeader
 
 
@@ -57,15 +57,18 @@ class RunningSweep:
         if self._journal is not None:
             self._journal.flush()
 
-    def finish(self, deliver: Callable[[Grid], None], report: SweepReport) -> None:
+    def finish(self, deliver: Callable[[Assembly], None], report: SweepReport) -> None:
         """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
         assert self._assembler is not None
         self.flush()
-        grid = self._assembler.finish()
+        assembly = self._assembler.assembly(repairs=REPAIRS)
+        quality = replace(
+            assembly.quality, requested_columns=report.requested_columns, dropped_bytes=report.dropped_bytes
+        )
         if self._journal is not None:
             self._journal.confirm(SweepEnd(self._sweep, Outcome.COMPLETE, report.received, report.digest))
             self._journal.close()
-        deliver(grid)
+        deliver(replace(assembly, quality=quality))
         if self._journal is not None and self._sweeps is not None:
             self._sweeps.discard(self._journal)
             self._journal = None

@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from node.durable import read_bounded, sync_folder, write_whole
+from node.scan_quality import ScanQuality
 from protocol.errors import LibraryError
 from protocol.grid import Grid, GridSpec, ImageArray, StepArray
 
@@ -42,12 +43,14 @@ class About:
     """Where a scan came from. Nothing of the patient: this is listed freely.
 
     created_unix_s : the node's clock, for people; it orders nothing.  source : "sweep", "import", ...
-    name : what to call it, at most 200 characters.  Raises ValueError when out of bounds.
+    name : what to call it, at most 200 characters.  quality : what the sweep was worth, None of a scan that came as a
+    file, or from a version that did not keep it.  Raises ValueError when out of bounds.
     """
 
     created_unix_s: float
     source: str = "sweep"
     name: str = ""
+    quality: ScanQuality | None = None
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.created_unix_s):

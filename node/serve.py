@@ -192,7 +192,9 @@ class NodeServer:
 
     async def _scan(self, request: web.Request) -> web.Response:
         scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
-        return _json(msgspec.to_builtins(scan_info(scan)))
+        quality = scan.about.quality
+        said = quality and m.ScanQuality(**asdict(quality), complaints=quality.complaints)
+        return _json({**msgspec.to_builtins(scan_info(scan)), "quality": said})
 
     async def _coarse(self, request: web.Request) -> web.Response:
         """The first view as its two refinements, one behind the other, each behind its length (u32, little-endian)."""

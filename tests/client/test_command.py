@@ -185,9 +185,18 @@ class Turntable:
     def __init__(self, *phases: dict[str, Any]) -> None:
         self.phases = [{"progress": 0.0, "sweeps": 0, "why": "", **phase} for phase in phases]
         self.swept = threading.Event()
+        quality = {"coverage": 0.5, "noiseMm": 0.025, "holes": 3, "complaints": ["something moved\x1b"], "later": 1}
+        self.described: dict[str, object] = {"id": "fresh", "quality": quality}
 
     def routes(self) -> tuple[web.RouteDef, ...]:
-        return web.get("/v1/node", self.node), web.post("/v1/sweeps", self.sweep)
+        return (
+            web.get("/v1/node", self.node),
+            web.post("/v1/sweeps", self.sweep),
+            web.get("/v1/scans/fresh", self.scan),
+        )
+
+    async def scan(self, request: web.Request) -> web.Response:
+        return web.json_response(self.described)
 
     async def node(self, request: web.Request) -> web.Response:
         phase = self.phases.pop(0) if len(self.phases) > 1 else self.phases[0]
@@ -211,7 +220,35 @@ def test_scan_sweeps_once_and_prints_the_new_scan(capsys: pytest.CaptureFixture[
     table = Turntable({"phase": "connecting"}, {"phase": "ready"}, sweeping, {"phase": "ready", "sweeps": 1})
     with serving_in_thread(table.announce, *table.routes()) as url:
         assert run("scan", "--node", url, "--json") == 0
-    assert json_lines(capsys.readouterr().out) == [{"scan": "fresh"}]
+    (said,) = json_lines(capsys.readouterr().out)
+    assert said["scan"] == "fresh" and said["quality"]["coverage"] == 0.5 and said["quality"]["complaints"]
+
+
+def test_scan_says_in_words_what_the_scan_is_worth(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "ready", "sweeps": 1})
+    with serving_in_thread(table.announce, *table.routes()) as url:
+        assert run("scan", "--node", url) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "scan fresh", "coverage 50.0 %, noise 0.025 mm, 3 void cells in holes", "something moved\\x1b",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("quality", [None, "absent"])
+def test_a_scan_of_which_no_quality_is_known_is_a_scan(
+    quality: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "ready", "sweeps": 1})
+    table.described = {} if quality else {"quality": None}
+    with serving_in_thread(table.announce, *table.routes()) as url:
+        assert run("scan", "--node", url, "--json") == 0
+    assert json_lines(capsys.readouterr().out) == [{"scan": "fresh", "quality": None}]
+
+
+def test_a_quality_that_makes_no_sense_is_refused() -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "ready", "sweeps": 1})
+    table.described = {"quality": {"coverage": 2}}
+    with serving_in_thread(table.announce, *table.routes()) as url, pytest.raises(RemoteWireError, match="coverage"):
+        run("scan", "--node", url)
 
 
 def test_a_sweep_that_fails_says_why() -> None:
@@ -225,7 +262,7 @@ def test_trouble_of_an_earlier_sweep_is_not_taken_for_this_one_s(capsys: pytest.
     table = Turntable(old, {"phase": "starting"}, {"phase": "sweeping"}, {"phase": "ready", "sweeps": 1})
     with serving_in_thread(table.announce, *table.routes()) as url:
         assert run("scan", "--node", url, "--json") == 0
-    assert json_lines(capsys.readouterr().out) == [{"scan": "fresh"}]
+    assert [said["scan"] for said in json_lines(capsys.readouterr().out)] == ["fresh"]
 
 
 def test_a_node_without_a_scanner_is_named() -> None:

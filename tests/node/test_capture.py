@@ -22,14 +22,17 @@ from drivers.scanner import (
 )
 from drivers.serial_port import SerialPort
 from node import durable
+from node.assemble import Assembly
 from node.capture import Capture, CaptureStatus
 from node.journal import Journals
 from node.resume import publish_complete
 from node.running_sweep import RunningSweep
+from node.scan_quality import ScanQuality, coverage_of
 from protocol.errors import LibraryError, PortLost
 from protocol.grid import Grid, GridSpec
 from protocol.scanner_messages import RangeColumn, TextureColumn
 from simulators.carriers import PtyPort, serve
+from simulators.faults import FaultyScanner, parse_faults
 from simulators.scanner import SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.sweep import Sweep
@@ -60,7 +63,7 @@ class Plug:
         self._link = link
         self._port: PtyPort | None = None
 
-    def plug(self, scanner: SimulatedScanner) -> None:
+    def plug(self, scanner: SimulatedScanner | FaultyScanner) -> None:
         self._stop = threading.Event()
         self._port = PtyPort(self._link, FAST_BAUD)
         self._thread = threading.Thread(target=serve, args=(scanner, self._port, self._stop))
@@ -83,10 +86,14 @@ class Node:
         self.events: queue.Queue[SweepEvent] = queue.Queue()
         self.sweeps = Journals(folder)
         self.deliver: Callable[[Grid], None] = self.grids.put
+        self.qualities: list[ScanQuality] = []
         self.capture = Capture(
-            lambda: SerialPort(str(link)), ScannerConfig(progress_s=0.02), lambda grid: self.deliver(grid),
-            self.events.put, self.sweeps,
+            lambda: SerialPort(str(link)), ScannerConfig(progress_s=0.02), self.take, self.events.put, self.sweeps,
         )  # fmt: skip
+
+    def take(self, assembly: Assembly) -> None:
+        self.deliver(assembly.grid)
+        self.qualities.append(assembly.quality)
 
     def wait_for(self, kind: type[SweepEvent]) -> Any:
         while not isinstance(event := self.events.get(timeout=WAIT_S), kind):
@@ -135,6 +142,18 @@ def test_a_sweep_becomes_a_grid_and_its_journal_goes(plug: Plug, node: Node, tmp
         assert node.capture.status.sweeps == count
     assert list((tmp_path / "sweeps").iterdir()) == []
     assert node.sweeps.interrupted() == []
+
+
+def test_a_scan_comes_with_its_quality_and_every_sample_as_it_was_measured(plug: Plug, node: Node) -> None:
+    bad_line = parse_faults("loss=0.05", 3)[0]
+    plug.plug(FaultyScanner(lambda boot_id: device(boot_id=boot_id), bad_line, 3))
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    assert is_truth(node.grids.get(timeout=WAIT_S))
+    node.wait_until("ready")
+    (quality,) = node.qualities
+    assert quality.coverage == coverage_of(TRUTH.range_steps) and (quality.spikes, quality.filled) == (0, 0)
+    assert quality.requested_columns > 0 and quality.dropped_bytes > 0
 
 
 def test_only_one_sweep_is_asked_for_at_a_time(plug: Plug, node: Node) -> None:
@@ -348,7 +367,7 @@ def test_a_grid_that_is_not_taken_stays_and_is_published_later(plug: Plug, node:
     node.wait_until("ready", "the disk is full")
     (sweep,) = node.sweeps.interrupted()
     assert sweep.is_complete and node.capture.status.sweeps == 0
-    assert publish_complete(node.sweeps, full) == [f"could not publish sweep {sweep.id}: the disk is full"]
+    assert publish_complete(node.sweeps, node.take) == [f"could not publish sweep {sweep.id}: the disk is full"]
     node.deliver = node.grids.put
     assert node.capture.request_resume(sweep.id)
     assert is_truth(node.grids.get(timeout=WAIT_S))
@@ -372,7 +391,7 @@ def test_columns_that_the_scanner_counted_otherwise_never_become_a_scan(
     node.wait_until("ready", "does not confirm them")
     node.capture.stop()
     again = Journals(tmp_path / "sweeps")
-    assert publish_complete(again, node.deliver) == [] and node.grids.empty()
+    assert publish_complete(again, node.take) == [] and node.grids.empty()
     assert [kept.id for kept in again.interrupted()] == [sweep.id]
 
 
@@ -381,7 +400,7 @@ def test_a_whole_sweep_whose_count_had_not_come_is_counted_when_it_goes_on(
 ) -> None:
     finish = RunningSweep.finish
 
-    def cut(running: RunningSweep, deliver: Callable[[Grid], None], report: SweepReport) -> None:
+    def cut(running: RunningSweep, deliver: Callable[[Assembly], None], report: SweepReport) -> None:
         monkeypatch.setattr(RunningSweep, "finish", finish)
         raise PortLost("tty: unplugged")
 
@@ -419,7 +438,8 @@ def test_complete_sweeps_of_a_crashed_node_are_published(plug: Plug, node: Node,
     assert node.capture.request_sweep()
     node.wait_for(SweepInterrupted)
     node.capture.stop()
-    sweeps, grids = Journals(tmp_path / "sweeps"), list[Grid]()
-    (said,) = publish_complete(sweeps, grids.append)
-    assert said.startswith("published sweep") and is_truth(grids[0])
-    assert sweeps.interrupted() == [] and publish_complete(sweeps, grids.append) == []
+    sweeps, made = Journals(tmp_path / "sweeps"), list[Assembly]()
+    (said,) = publish_complete(sweeps, made.append)
+    assert said.startswith("published sweep") and is_truth(made[0].grid)
+    assert made[0].quality.coverage == coverage_of(TRUTH.range_steps)
+    assert sweeps.interrupted() == [] and publish_complete(sweeps, made.append) == []

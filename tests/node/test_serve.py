@@ -12,6 +12,7 @@ from node import health
 from node.capture import CaptureStatus
 from node.durable import EASY_BYTES
 from node.library import About, Library
+from node.scan_quality import ScanQuality
 from tests.node.scans import make_grid
 from tests.node.served import Client, served
 
@@ -109,6 +110,23 @@ async def test_a_scan_says_when_it_was_made(tmp_path: Path) -> None:
             scan = library.add(make_grid(40, 24, seed=seed), About(unix_s))
             _, info = await ask(node, f"/v1/scans/{scan.id}")
             assert info.get("created") == created
+
+
+async def test_a_scan_says_what_its_sweep_was_worth(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    quality = ScanQuality(0.75, noise_mm=0.25, dead_rows=2, dropped_bytes=9)
+    swept = library.add(make_grid(40, 24, seed=1), About(0.0, quality=quality))
+    library.close()
+    library = Library(tmp_path)
+    brought = library.add(make_grid(40, 24, seed=2), About(0.0, "import"))
+    async with served(library) as (node, _):
+        _, info = await ask(node, f"/v1/scans/{swept.id}")
+        assert info["quality"] == {
+            "coverage": 0.75, "noiseMm": 0.25, "deadRows": 2, "droppedBytes": 9,
+            "complaints": ["2 rows of the range camera measure nothing"],
+        }  # fmt: skip
+        _, info = await ask(node, f"/v1/scans/{brought.id}")
+        assert info["quality"] is None
 
 
 @pytest.fixture

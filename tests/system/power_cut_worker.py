@@ -16,6 +16,7 @@ import numpy as np
 
 from drivers.scanner import ScannerConfig
 from node.archive import backup
+from node.assemble import Assembly
 from node.capture import Capture
 from node.library import About, Library
 from node.sidecar import Changes
@@ -119,9 +120,9 @@ def restore(library: Library, seed: int, note: Note) -> None:
 def sweep(library: Library, seed: int, note: Note) -> None:
     ended = threading.Event()
 
-    def deliver(grid: Grid) -> None:
+    def deliver(assembly: Assembly) -> None:
         note("delivering", seed)
-        note("added", library.add(grid, About(time.time())).id, seed)
+        note("added", library.add(assembly.grid, About(time.time())).id, seed)
         ended.set()
 
     scanner = SimulatedScanner(Turntable(Specimen("noise", grid(seed)), turn_s=0.05), boot_id=1 + seed)

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from node.assemble import Assembly
 from node.library import About, Library, content_id
 from node.library_folder import OWN, SWEEPS
 from node.resume import publish_complete
-from protocol.grid import Grid
 from tests.system.power_cut_worker import grid
 
 ROUNDS_OF_EACH = 6
@@ -124,8 +124,8 @@ def check_sweeps(library: Library, seed: int, promises: Promises) -> None:
             seen = whole[column.row0 : column.row0 + column.rows, column.column]
             assert np.array_equal(seen, column.samples)
 
-    def deliver(grid: Grid) -> None:
-        promises.kept.add(library.add(grid, About(1e9)).id)
+    def deliver(assembly: Assembly) -> None:
+        promises.kept.add(library.add(assembly.grid, About(1e9)).id)
 
     publish_complete(library.sweeps, deliver)
     for sweep in library.sweeps.interrupted():

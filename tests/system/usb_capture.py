@@ -15,6 +15,7 @@ import pytest
 
 from drivers.discover import config_for, open_port
 from drivers.scanner import SweepEvent, SweepInterrupted
+from node.assemble import Assembly
 from node.capture import Capture
 from node.journal import Journals
 from protocol.framing import USB_PAYLOAD_MAX
@@ -55,7 +56,10 @@ def capturing(address: str, folder: Path) -> Iterator[tuple[Capture, queue.Queue
     def watch(event: SweepEvent) -> None:
         told.append((time.monotonic(), event))
 
-    capture = Capture(lambda: open_port(address), config_for(address), grids.put, watch, Journals(folder))
+    def deliver(assembly: Assembly) -> None:
+        grids.put(assembly.grid)
+
+    capture = Capture(lambda: open_port(address), config_for(address), deliver, watch, Journals(folder))
     capture.start()
     try:
         while capture.status.phase != "ready":
