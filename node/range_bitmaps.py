@@ -47,7 +47,7 @@ def reach_range(
     """
     held = state.holdings.channels[Channel.RANGE]
     rank = _of_region(held.rank, region)
-    good = (rank > COARSE_RANK) & (_of_region(state.cells_beyond(target_steps), region) <= FEW_CELLS)
+    good = (rank > COARSE_RANK) & (state.cells_beyond(target_steps, region) <= FEW_CELLS)
     better = rank > range_rank(wanted.quantum)
     apart = good | better if better.any() or good.mean() >= LISTED_SHARE else np.zeros_like(good)
     allowed = _allowed_beyond(scan, region)
@@ -61,11 +61,11 @@ def reach_range(
     if coded is not None:
         note_range(scan, after, coded, target_steps)
     first = [coded] if coded is not None else []
-    poor = np.minimum(_of_region(after.cells_beyond(target_steps), region), _cells_inside(held.shape, region))
+    poor = after.cells_beyond(target_steps, region)
     kept = ~_of_region(_adopted(held.shape, coded), region)
     if poor[kept].sum() + _cells_beyond(scan, coded, region, target_steps) <= allowed:
         return first
-    second = _mend(scan, after, region, wanted, target_steps, poor, allowed)
+    second = _mend(scan, after, region, wanted, target_steps, _worst(poor, allowed), allowed)
     return [*first, second] if second is not None else first
 
 
@@ -75,21 +75,30 @@ def _mend(
     region: Region,
     wanted: RangeParameters,
     target_steps: float,
-    poor: NDArray[np.int64],
+    poor: BoolArray,
     allowed: int,
 ) -> Coded | None:
     """Encode the poor blocks again: at the spacing wanted where that makes them good enough, else at spacing 1."""
     held = state.holdings.channels[Channel.RANGE]
-    rank, level = (_of_region(array, region)[poor > 0] for array in (held.rank, held.level))
+    rank, level = (_of_region(array, region)[poor] for array in (held.rank, held.level))
     best = 65535 - int(rank.max())
     if wanted.p > 1 and level.min() >= _level_at(wanted.p):
-        coded = _code_listed(scan, state, region, RangeParameters(wanted.p, best - 1, None), poor == 0)
+        coded = _code_listed(scan, state, region, RangeParameters(wanted.p, best - 1, None), ~poor)
         if coded is not None and _cells_beyond(scan, coded, region, target_steps) <= allowed // 2:
             return coded
     quantum = min(2 * int(target_steps) + 1, best - 1)  # at spacing 1 no cell is off by more than half a quantum
     if quantum < 1:
         return None
-    return _code_listed(scan, state, region, RangeParameters(1, quantum, None), poor == 0)
+    return _code_listed(scan, state, region, RangeParameters(1, quantum, None), ~poor)
+
+
+def _worst(beyond: NDArray[np.int64], allowed: int) -> BoolArray:
+    """The fewest blocks without which no more than `allowed` cells are too far off."""
+    order = np.argsort(beyond, axis=None)[::-1]
+    left = beyond.sum() - np.cumsum(beyond.ravel()[order])
+    worst = np.zeros(beyond.size, np.bool_)
+    worst[order[: int(np.argmax(left <= allowed)) + 1]] = True
+    return worst.reshape(beyond.shape)
 
 
 def _level_at(p: int) -> int:
@@ -113,16 +122,6 @@ def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:
     if coded is not None:
         adopted.ravel()[coded.selection.adopted_blocks()] = True
     return adopted
-
-
-def _cells_inside(shape: ChannelShape, region: Region) -> NDArray[np.int64]:
-    """How many cells of each block that a region touches lie in it. (blocks_high, blocks_wide)"""
-    left, top, wide, high = region.blocks(RANGE_BLOCK)
-    row = np.arange(top * RANGE_BLOCK, (top + high) * RANGE_BLOCK)
-    column = np.arange(left * RANGE_BLOCK, (left + wide) * RANGE_BLOCK)
-    rows = ((row >= region.top) & (row < region.top + region.height)).reshape(high, RANGE_BLOCK).sum(axis=1)
-    across = ((column - region.left) % region.turn < region.width).reshape(wide, RANGE_BLOCK).sum(axis=1)
-    return np.asarray(np.multiply.outer(rows, across), np.int64)
 
 
 def _allowed_beyond(scan: Scan, region: Region) -> int:

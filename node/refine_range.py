@@ -17,7 +17,7 @@ from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
 from protocol.codec_lift import encode_and_decode, survey
-from protocol.grid import VOID, BoolArray, StepArray
+from protocol.grid import RANGE_BLOCK, VOID, BoolArray, StepArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
@@ -128,11 +128,14 @@ def settle_range(scan: Scan, state: ClientState, coded: Coded, target_steps: flo
     """The part of note_range that can wait until the refinement is on its way: digest and errors."""
     patch, selection = client_range(scan, coded), coded.selection
     state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
-    error, beyond = block_errors(patch, np.asarray(cut(scan.range_steps, selection)), target_steps)
+    truth = np.asarray(cut(scan.range_steps, selection), np.uint16)
+    error, far = block_errors(patch, truth, selection.y.size, selection.x.size, target_steps)
     rows, columns = np.nonzero(selection.adopted)
     blocks = selection.y.block[rows], selection.x.block[columns]
-    state.error[blocks], state.beyond[blocks] = error[rows, columns], beyond[rows, columns]
-    state.target_steps[blocks] = target_steps
+    state.error[blocks], state.target_steps[blocks] = error[rows, columns], target_steps
+    cells = np.arange(RANGE_BLOCK)
+    to, place = blocks[0][:, None] * RANGE_BLOCK + cells, rows[:, None] * RANGE_BLOCK + cells
+    state.far[to, blocks[1][:, None]] = far[place, columns[:, None]]
 
 
 class _Trial:

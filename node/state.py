@@ -12,7 +12,8 @@ from node.library import Scan
 from protocol.grid import RANGE_BLOCK, VOID, IntArray, StepArray
 from protocol.holdings import ChannelHoldings, Holdings
 from protocol.lattice import Channel, ChannelShape, channel_shapes
-from protocol.reconstruct import coarse_to_range
+from protocol.reconstruct import coarse_to_range, pad_blocks
+from protocol.region import Region
 
 
 @dataclass(slots=True, eq=False)
@@ -20,7 +21,8 @@ class ClientState:
     """One client's model of one scan, as the node believes it to be.
 
     error : (blocks_y, blocks_x) uint16 largest range error left in each block. [steps]
-    beyond : likewise uint8, how many of its cells are further off than target_steps, likewise float32.
+    far : (8 blocks_y, blocks_x) uint8 a bit for each cell, the leftmost highest: further off than its block's
+        target_steps, (blocks_y, blocks_x) float32; infinite where the bits mean nothing.
     missed : (texture blocks_y, blocks_x) float32 squared error per value left in each block; NaN where not measured.
     first_error : as error, with the first view alone; shared between copies.
     """
@@ -28,14 +30,14 @@ class ClientState:
     shapes: dict[Channel, ChannelShape]
     holdings: Holdings
     error: StepArray
-    beyond: NDArray[np.uint8]
+    far: NDArray[np.uint8]
     target_steps: NDArray[np.float32]
     missed: NDArray[np.float32]
     first_error: StepArray
 
     def copy(self) -> ClientState:
         """An independent copy, to plan on."""
-        arrays = self.error.copy(), self.beyond.copy(), self.target_steps.copy(), self.missed.copy()
+        arrays = self.error.copy(), self.far.copy(), self.target_steps.copy(), self.missed.copy()
         return ClientState(self.shapes, self.holdings.copy(), *arrays, self.first_error)
 
     def take_word(self, channels: dict[Channel, ChannelHoldings]) -> None:
@@ -48,16 +50,29 @@ class ClientState:
         other = (ours.level != theirs.level) | (ours.rank != theirs.rank)
         bound = np.where(theirs.level == 0, (65535 - theirs.rank.astype(np.int64)) // 2, self.first_error)
         self.error[other] = bound[other].astype(np.uint16)
-        self.beyond[other], self.target_steps[other] = RANGE_BLOCK * RANGE_BLOCK, np.inf
+        self.target_steps[other] = np.inf
         held, said = self.holdings.channels[Channel.TEXTURE], channels[Channel.TEXTURE]
         self.missed[(held.level != said.level) | (held.rank != said.rank)] = np.nan
         self.holdings = Holdings(channels)
 
-    def cells_beyond(self, target_steps: float) -> IntArray:
-        """At most how many cells of each block are further off than target_steps. (blocks_y, blocks_x) int64"""
-        known = (self.target_steps <= target_steps) | (self.error <= target_steps)
-        counted = np.where(self.error <= target_steps, 0, self.beyond)
-        return np.where(known, counted, RANGE_BLOCK * RANGE_BLOCK).astype(np.int64)
+    def cells_beyond(self, target_steps: float, region: Region) -> IntArray:
+        """At most how many cells of each block that a region touches lie in it and are further off than target_steps.
+
+        Returns (blocks_high, blocks_wide) int64.
+        """
+        left, top, wide, high = region.blocks(RANGE_BLOCK)
+        place = np.arange(top, top + high)[:, None], np.arange(left, left + wide)[None, :] % self.error.shape[1]
+        row = np.arange(top * RANGE_BLOCK, (top + high) * RANGE_BLOCK)
+        column = np.arange(left * RANGE_BLOCK, (left + wide) * RANGE_BLOCK)
+        rows = (row >= region.top) & (row < region.top + region.height)
+        columns = np.packbits((column - region.left) % region.turn < region.width)
+        if region.turn % RANGE_BLOCK:
+            columns[:] = 0xFF  # behind a cut block columns are not where they seem: count whole blocks
+        inside = np.where(rows[:, None], columns[None, :], 0).astype(np.uint8)
+        known = self.target_steps[place] <= target_steps
+        bits = np.where(known.repeat(RANGE_BLOCK, axis=0), self.far[row[:, None], place[1]], 0xFF) & inside
+        count = np.bitwise_count(bits).reshape(high, RANGE_BLOCK, wide).sum(axis=1, dtype=np.int64)
+        return np.where(self.error[place] <= target_steps, 0, count)
 
 
 def scan_shapes(scan: Scan) -> dict[Channel, ChannelShape]:
@@ -70,25 +85,24 @@ def first_state(scan: Scan, coarse_steps: StepArray) -> ClientState:
     """The state of a client that has the first view of a scan and nothing else; coarse_steps as it was sent."""
     shapes = scan_shapes(scan)
     dense = coarse_to_range(coarse_steps, shapes[Channel.RANGE])
-    error, beyond = block_errors(dense, scan.range_steps, math.inf)
+    blocks = [np.diff(np.append(np.arange(0, size, RANGE_BLOCK), size)) for size in dense.shape]
+    error, far = block_errors(dense, scan.range_steps, blocks[0], blocks[1], math.inf)
     target = np.full(error.shape, np.inf, np.float32)  # so that nothing counts as good enough
     missed = np.full(shapes[Channel.TEXTURE].blocks, np.nan, np.float32)
-    return ClientState(shapes, Holdings.coarse(shapes), error, beyond, target, missed, error)
+    return ClientState(shapes, Holdings.coarse(shapes), error, far, target, missed, error)
 
 
-def block_errors(patch: StepArray, truth: StepArray, target_steps: float) -> tuple[StepArray, NDArray[np.uint8]]:
-    """Of each 8x8 block measured in truth: the largest |patch - truth|, and how many cells are further off than target.
+def block_errors(
+    patch: StepArray, truth: StepArray, heights: IntArray, widths: IntArray, target_steps: float
+) -> tuple[StepArray, NDArray[np.uint8]]:
+    """Of each block of a rectangle: the largest |patch - truth| where measured, and which cells are beyond the target.
 
-    Returns (rows, columns) uint16 [steps] and uint8.
+    heights, widths : cells of each row and column of blocks.
+    Returns (rows, columns) uint16 [steps], and (8 rows, columns) uint8 of bits.
     """
     difference = np.abs(patch.astype(np.int32) - truth)
     difference[truth == VOID] = 0
-    rows, columns = _starts(patch.shape[0]), _starts(patch.shape[1])
-    largest = np.maximum.reduceat(np.maximum.reduceat(difference, rows, axis=0), columns, axis=1)
-    far = (difference > target_steps).view(np.uint8)
-    beyond = np.add.reduceat(np.add.reduceat(far, rows, axis=0), columns, axis=1)
-    return largest.astype(np.uint16), beyond.astype(np.uint8)
-
-
-def _starts(size: int) -> IntArray:
-    return np.arange(0, size, RANGE_BLOCK)
+    padded = pad_blocks(difference, heights, widths, RANGE_BLOCK)
+    rows, columns = heights.size, widths.size
+    largest = padded.reshape(rows, RANGE_BLOCK, columns, RANGE_BLOCK).max(axis=(1, 3))
+    return largest.astype(np.uint16), np.packbits(padded > target_steps, axis=1)

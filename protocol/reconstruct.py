@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from protocol.grid import VOID, BoolArray, FloatArray, ImageArray, IntArray, Ste
 from protocol.holdings import ChannelHoldings, HashArray, hash_blocks
 from protocol.lattice import QUARTERS, Axis, ChannelShape, Lattice
 
+Number = TypeVar("Number", bound=np.number[Any])
 BAND_ROWS = 256
 LightArray = NDArray[np.float32]
 
@@ -203,12 +205,18 @@ def content_hashes(patch: StepArray, selection: Selection) -> HashArray:
     """Hashes of the adopted blocks of a range patch, in the order of Selection.adopted_blocks. (n,) uint32."""
     side = selection.lattice.shape.block
     rows, columns = selection.adopted.shape
-    if patch.shape != (rows * side, columns * side):
-        padded = np.zeros((rows * side, columns * side), np.uint16)
-        padded[np.ix_(_padded_place(selection.y.size, side), _padded_place(selection.x.size, side))] = patch
-        patch = padded
+    patch = pad_blocks(patch, selection.y.size, selection.x.size, side)
     cells = patch.reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
     return hash_blocks(cells[selection.adopted])
+
+
+def pad_blocks(cells: NDArray[Number], heights: IntArray, widths: IntArray, side: int) -> NDArray[Number]:
+    """A rectangle of blocks, cut ones padded with 0 to their full side. heights, widths : cells in each block."""
+    if cells.shape == (heights.size * side, widths.size * side):
+        return cells
+    padded = np.zeros((heights.size * side, widths.size * side), cells.dtype)
+    padded[np.ix_(_padded_place(heights, side), _padded_place(widths, side))] = cells
+    return padded
 
 
 def _padded_place(size: IntArray, side: int) -> IntArray:

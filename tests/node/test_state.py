@@ -8,10 +8,13 @@ import pytest
 from node.first_view import build_first_view
 from node.foveate import plan_update
 from node.library import Scan
+from node.refine_range import client_range
 from node.state import ClientState
 from protocol.holdings import ChannelHoldings
 from protocol.lattice import Channel
 from protocol.messages import Look, LookParameters, RangeParameters
+from protocol.reconstruct import paste
+from protocol.region import region_round
 from tests.node.scans import keep, make_grid
 
 
@@ -38,7 +41,8 @@ def test_a_client_that_holds_what_we_thought_changes_nothing(scan: Scan) -> None
     after = plan_update(scan, first, look, "htj2k").settled().state
     same = restated(after)
     np.testing.assert_array_equal(same.error, after.error)
-    np.testing.assert_array_equal(same.beyond, after.beyond)
+    np.testing.assert_array_equal(same.far, after.far)
+    np.testing.assert_array_equal(same.target_steps, after.target_steps)
     assert same.holdings.content == 0
 
 
@@ -53,4 +57,20 @@ def test_what_is_held_in_a_way_unknown_to_us_is_sent_again_where_it_matters(scan
     first = build_first_view(scan, "htj2k", 32768).state
     state = restated(first, level=2, rank=65535 - 9)
     np.testing.assert_array_equal(state.error, first.error)
-    assert (state.cells_beyond(10) == 64).any()
+    region = region_round(0.5, 0.5, 1.0, scan.spec.width, scan.spec.height)
+    assert (state.cells_beyond(10, region) == 64).any()
+
+
+def test_cells_beyond_are_counted_as_they_are(scan: Scan) -> None:
+    first = build_first_view(scan, "htj2k", 32768).state
+    look = Look(1, 0.52, 0.47, range_mm=0.02, parameters=LookParameters(RangeParameters(4, 9)))
+    update = plan_update(scan, first, look, "htj2k").settled()
+    (coded,) = update.coded
+    region = region_round(0.5, 0.5, 0.02, scan.spec.width, scan.spec.height)
+    patch, selection = client_range(scan, coded), coded.selection
+    dense = np.array(scan.range_steps)
+    paste(dense, patch, selection)
+    far = np.abs(dense.astype(int) - scan.range_steps) > 0.02 / scan.spec.step_mm
+    counted = update.state.cells_beyond(0.02 / scan.spec.step_mm, region)
+    assert counted.sum() == far[region.rows][:, region.columns].sum()
+    assert counted.any()
