@@ -156,7 +156,7 @@ class PairingRoutes:
             trouble=f'<p role="alert">{html.escape(trouble)}</p>\n' if trouble else "",
             fingerprint=pairing.fingerprint_text(tls.fingerprint),
         )
-        headers = {"Content-Security-Policy": POLICY}
+        headers = {"Content-Security-Policy": POLICY, "Referrer-Policy": "same-origin"}  # else its form says no Origin
         return web.Response(text=page, status=status, content_type="text/html", headers=headers)
 
     # -- looking after it ------------------------------------------------------------------------------------------

@@ -1,0 +1,51 @@
+"""A browser that was never here before: led to the pairing page, let in by a code, put out again."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+from foveascan import PROGRAM, started
+from node.library import About, Library
+from tests.client.viewer.browser import blank, launch, wait_drawn
+from tests.node.scans import make_grid
+
+
+def run(*arguments: str) -> dict[str, str]:
+    ran = subprocess.run([*PROGRAM, *arguments, "--json"], capture_output=True, check=True, timeout=60)
+    said: dict[str, str] = json.loads(ran.stdout)
+    return said
+
+
+def keep_a_scan(folder: Path) -> None:
+    library = Library(folder)
+    library.add(make_grid(160, 96), About(0.0))
+    library.close()
+
+
+def test_a_browser_is_let_in_by_a_code_and_put_out_again(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
+        aside.submit(keep_a_scan, tmp_path).result()
+    serve = ["serve", "--library", str(tmp_path), "--listen", "127.0.0.1:0", "--json"]
+    with started(*serve) as (_, ready), sync_playwright() as playwright:
+        offered = run("pair", "--name", "tablet", "--library", str(tmp_path))
+        running = launch(playwright)
+        with blank(running, ignore_https_errors=True) as (page, _):
+            page.goto(ready["url"])
+            assert page.url == f"{ready['url']}/pair"
+            shown = page.locator("ol code").text_content() or ""
+            assert shown.replace(":", "").lower() == offered["fingerprint"]
+            page.fill("input", offered["code"])
+            page.click("button")
+            page.wait_for_selector("html[data-scan]", state="attached")
+            wait_drawn(page)
+            assert page.url.startswith(f"{ready['url']}/")
+            assert "foveascan" not in page.evaluate("document.cookie")
+            run("access", "revoke", "tablet", "--library", str(tmp_path))
+            page.goto(f"{ready['url']}/")
+            assert page.url == f"{ready['url']}/pair"
+        running.close()
