@@ -15,6 +15,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from drivers.discover import Arrivals
 from drivers.port import Port
 from drivers.scanner import (
     Scanner,
@@ -37,6 +38,7 @@ log = logging.getLogger(__name__)
 
 BACKOFF_S = (0.5, 8.0)
 LISTEN_S = 1.0
+ONE_TURN = SweepRequest()
 
 SweepEvents = Generator[SweepEvent, None, None]
 Phase = Literal["no scanner", "connecting", "ready", "starting", "sweeping", "stopped"]
@@ -86,6 +88,7 @@ class Capture:
     watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
     SweepInterrupted for it, whatever the scanner said.
     sweeps : where columns are kept until their grid is delivered; without it, a cut sweep is lost.
+    request : how to sweep.
     """
 
     def __init__(
@@ -95,12 +98,14 @@ class Capture:
         deliver: Callable[[Assembly], None],
         watch: Callable[[SweepEvent], None] = lambda event: None,
         sweeps: Journals | None = None,
+        request: SweepRequest = ONE_TURN,
     ) -> None:
         self._open_port = open_port
         self._config = config
         self._deliver = deliver
         self._watch = watch
         self._sweeps = sweeps
+        self._sweep_request = request
         self._beat_s = time.monotonic()
         self._stop = threading.Event()
         self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
@@ -126,7 +131,7 @@ class Capture:
 
     def request_sweep(self) -> bool:
         """Ask for a sweep; False, and nothing will come of it, when the scanner is not ready: see status.refusal."""
-        return self._request(SweepRequest())
+        return self._request(self._sweep_request)
 
     def request_resume(self, sweep_id: str) -> bool:
         """Ask to go on with an interrupted sweep; False as for request_sweep. Raises LibraryError when unknown."""
@@ -163,6 +168,12 @@ class Capture:
                 self._port.cancel()
 
     def _run(self) -> None:
+        with closing(Arrivals()) as arrivals:
+            self._connect(arrivals)
+        self._status = replace(self._status, phase="stopped")
+
+    def _connect(self, arrivals: Arrivals) -> None:
+        """Serve the port, time and again until stopped; where it is away, sooner when something is plugged in."""
         failures = 0
         while not self._stop.is_set():
             try:
@@ -176,8 +187,9 @@ class Capture:
                     self._order = None  # for a scanner that went away: the next one must not turn unasked
                     self._status = replace(self._status, phase="connecting", progress=0.0, why=str(error))
             self._beat()
-            self._stop.wait(min(BACKOFF_S[1], BACKOFF_S[0] * 2**min(failures, 8)) * random.uniform(0.5, 1.0))
-        self._status = replace(self._status, phase="stopped")
+            backoff_s = min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures, 8)) * random.uniform(0.5, 1.0)
+            if arrivals.wait(backoff_s, self._stop):
+                failures = 0  # it may take a moment until it can be opened
 
     def _beat(self) -> None:
         self._beat_s = time.monotonic()

@@ -44,6 +44,9 @@ class Capture(Struct, frozen=True, forbid_unknown_fields=True):
     scanner: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # address; none: library only
     baud: Annotated[int, Meta(ge=9600, le=12_000_000)] = 3_000_000  # [Bd]; a USB CDC device ignores it
     stale_s: Annotated[float, Meta(ge=0.1, le=60)] = 2.0  # a link quiet for so long is stale
+    passes: Annotated[int, Meta(ge=1, le=64)] = 1  # turns that are averaged: noise falls with their square root
+    overlap: Annotated[int, Meta(ge=0, le=255)] = 0  # [1/256 turn] seen again at the end, to tell noise and slip
+    stride: Annotated[int, Meta(ge=1, le=255)] = 1  # >1: a fast turn with every so many-th column comes first
 
 
 class Server(Struct, frozen=True, forbid_unknown_fields=True):

@@ -30,6 +30,7 @@ from node.serve import NodeServer
 from node.tls import Tls
 from protocol import messages as m
 from protocol.pairing import fingerprint_text
+from protocol.scanner_messages import SweepRequest
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +117,9 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
 
     opened = partial(open_port, address, config.capture.baud)
     link = config_for(address, config.capture.stale_s)
-    return Capture(opened, link, deliver, live.watch, library.sweeps), announce
+    c = config.capture
+    request = SweepRequest(passes=c.passes, overlap=c.overlap, stride=c.stride)
+    return Capture(opened, link, deliver, live.watch, library.sweeps, request), announce
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:

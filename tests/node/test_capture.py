@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.discover import Arrivals
 from drivers.scanner import (
     Scanner,
     ScannerConfig,
@@ -21,7 +22,7 @@ from drivers.scanner import (
     SweepStarted,
 )
 from drivers.serial_port import SerialPort
-from node import durable
+from node import capture, durable
 from node.assemble import Assembly
 from node.capture import Capture, CaptureStatus
 from node.journal import Journals
@@ -30,7 +31,7 @@ from node.running_sweep import RunningSweep
 from node.scan_quality import ScanQuality, coverage_of
 from protocol.errors import LibraryError, PortLost
 from protocol.grid import Grid, GridSpec
-from protocol.scanner_messages import RangeColumn, TextureColumn
+from protocol.scanner_messages import RangeColumn, SweepRequest, TextureColumn
 from simulators.carriers import PtyPort, serve
 from simulators.faults import FaultyScanner, parse_faults
 from simulators.scanner import SimulatedScanner
@@ -195,6 +196,47 @@ def test_an_idle_scanner_that_is_unplugged_is_noticed_and_found_again(plug: Plug
     plug.plug(device(boot_id=2))
     node.wait_until("ready")
     assert node.capture.request_sweep()
+    assert is_truth(node.grids.get(timeout=WAIT_S))
+
+
+def test_a_scanner_that_is_plugged_in_is_met_at_once_however_long_it_was_away(
+    plug: Plug, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugged = threading.Event()
+
+    class Told(Arrivals):
+        def wait(self, timeout_s: float, stop: threading.Event) -> bool:
+            return plugged.wait(timeout_s)
+
+    monkeypatch.setattr(capture, "Arrivals", Told)
+    monkeypatch.setattr(capture, "BACKOFF_S", (60.0, 60.0))
+    node = Node(tmp_path / "tty", tmp_path / "sweeps")
+    node.capture.start()
+    node.wait_until("connecting", "tty")
+    plug.plug(device())
+    plugged.set()
+    node.wait_until("ready")
+    node.capture.stop()
+
+
+def test_a_sweep_is_asked_for_as_the_node_is_set(plug: Plug, tmp_path: Path) -> None:
+    made: queue.Queue[Assembly] = queue.Queue()
+    plug.plug(device())
+    request = SweepRequest(passes=2, overlap=64)
+    swept = Capture(lambda: SerialPort(str(tmp_path / "tty")), ScannerConfig(), made.put, request=request)
+    swept.start()
+    while not swept.request_sweep():
+        time.sleep(0.01)
+    assembly = made.get(timeout=WAIT_S)
+    swept.stop()
+    assert is_truth(assembly.grid) and assembly.quality.passes == 2 and assembly.quality.noise_mm == 0.0
+
+
+def test_a_sweep_with_an_overlap_goes_on_with_a_scanner_that_was_restarted(plug: Plug, node: Node) -> None:
+    node.capture._sweep_request = SweepRequest(overlap=64)
+    sweep_id = cut(plug, node, device(boot_id=2))
+    assert node.sweeps.get(sweep_id).header.overlap == 64
+    assert node.capture.request_resume(sweep_id)
     assert is_truth(node.grids.get(timeout=WAIT_S))
 
 
