@@ -112,7 +112,8 @@ def _mesh_options(args: argparse.Namespace) -> MeshOptions:
     from exchange.formats import MeshOptions
     from exchange.mesh_file import Placing
 
-    return MeshOptions(args.size, Placing(args.up, args.unit_mm, args.centre), math.radians(args.theta0_deg))
+    placing = Placing(args.up, args.unit_mm, args.centre)
+    return MeshOptions(args.size, placing, math.radians(args.theta0_deg), args.geometry)
 
 
 @contextmanager
@@ -138,6 +139,9 @@ def _add_mesh(parser: argparse.ArgumentParser) -> None:
     mesh.add_argument("--up", choices=("z", "y", "x", "-z", "-y", "-x"), help="the axis that points up (z; glTF: y)")
     mesh.add_argument("--unit-mm", type=positive, metavar="MM", help="millimetres of its unit (1; glTF: 1000)")
     mesh.add_argument("--centre", action="store_true", help="put its middle on the turntable's axis")
+    mesh.add_argument(
+        "--geometry", choices=("cylinder", "sphere"), default="cylinder", help="sphere: closed, seen from inside"
+    )
     mesh.add_argument("--theta0-deg", type=number, default=0.0, metavar="DEG", help="angle of the seam (0)")
 
 

@@ -17,10 +17,11 @@ from client.errors import HoldingsDiffer
 from client.export import write_grid
 from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, decode_texture
 from protocol.errors import CodecError, LatticeError, RemoteWireError
-from protocol.grid import VOID, BoolArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
+from protocol.grid import VOID, BoolArray, FloatArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
 from protocol.holdings import ChannelHoldings, Holdings, range_rank, texture_rank
 from protocol.lattice import Channel, Parameters, build_lattice
 from protocol.messages import ScanInfo, Statement
+from protocol.range_payload import decode_selection
 from protocol.reconstruct import (
     Selection,
     coarse_to_range,
@@ -32,6 +33,7 @@ from protocol.reconstruct import (
     texture_patch,
 )
 from protocol.refinement import Generator, Refinement
+from protocol.sphere import default_mesh, ranges_on, vectors
 
 Codec = TypeVar("Codec", RangeCodec, TextureCodec)
 Array = TypeVar("Array", NDArray[np.float32], StepArray, ImageArray)
@@ -43,6 +45,14 @@ class Applied:
 
     blocks: IntArray
     apply_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Triangles. positions_mm : (V, 3) float64, z up, NaN where nothing was measured.  faces : (F, 3) int64."""
+
+    positions_mm: FloatArray
+    faces: IntArray
 
 
 class Model:
@@ -95,6 +105,16 @@ class Model:
     def grid(self) -> Grid:
         """The model as a grid, over the same read-only views."""
         return Grid(self.spec, self.range_steps, self.texture)
+
+    def default_mesh(self, intervals_v: int = 8, intervals_h: int = 12) -> Surface:
+        """A spherical model over directions pi/intervals_v apart down and 2 pi/intervals_h round, both poles once.
+
+        Raises LatticeError for a cylinder, and for numbers of which no mesh can be made.
+        """
+        mesh = default_mesh(intervals_v, intervals_h)
+        range_mm = ranges_on(mesh, self._steps, self.spec)
+        positions = range_mm[:, None] * vectors(mesh.theta_v, mesh.theta_h)
+        return Surface(positions + np.array([0, 0, self.spec.z_max_mm]), mesh.faces)
 
     def export(self, path: str | Path) -> None:
         """Write the model as it is now; the suffix is the format: .glb, .ply, .obj.zip, .stl or .npz.
@@ -156,7 +176,7 @@ class Model:
         selection, adopted = self._select(refinement)
         blocks = selection.adopted_blocks()
         if refinement.channel is Channel.RANGE:
-            steps = range_patch(selection, _decode_range(refinement, selection.sample_shape))
+            steps = range_patch(selection, _decode_selection(refinement, selection))
             _apply_mask(refinement, steps)
             paste(self._steps, steps, selection)
             self.holdings.add_content(blocks, content_hashes(steps, selection))
@@ -191,6 +211,11 @@ def spacing_of_levels(held: ChannelHoldings) -> NDArray[np.float32]:
 def _decode_range(refinement: Refinement, shape: tuple[int, int]) -> StepArray:
     """Transmitted range in steps, without voids."""
     return decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape, refinement.quality)
+
+
+def _decode_selection(refinement: Refinement, selection: Selection) -> StepArray:
+    """The same of a fovea."""
+    return decode_selection(selection, refinement.payload, _codec(RangeCodec, refinement.codec), refinement.quality)
 
 
 def texture_of(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:

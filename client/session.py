@@ -29,9 +29,10 @@ from client.rest import ask
 from client.stream import Stream, open_stream
 from client.update import Update
 from protocol import messages as m
-from protocol.errors import LocalWireError, RemoteWireError
+from protocol.errors import LatticeError, LocalWireError, RemoteWireError
 from protocol.holdings import LevelArray, RankArray
 from protocol.lattice import Channel
+from protocol.sphere import click_of
 
 
 class Held(NamedTuple):
@@ -189,6 +190,22 @@ class Session:
                     with suppress(NodeLost):
                         await self._send(m.Cancel(request))
                 raise
+
+    async def look_direction(self, theta_v: float, theta_h: float, **wanted: Any) -> Update:
+        """Refine a spherical model round a direction from its centre, and return once it holds what was asked for.
+
+        theta_v : polar angle [rad], 0 straight up to pi.  theta_h : angle round the axis, counter-clockwise from above.
+        wanted : as for `look`; window is a share of all directions. On a pole all sides are refined alike.
+        Raises what `look` raises, and LocalWireError for a model that is no sphere or a direction that is none.
+        """
+        spec = self._opened_model().spec
+        if spec.geometry != "sphere":
+            raise LocalWireError(f"the scan is a {spec.geometry}, not a sphere: look(u, v)")
+        try:
+            u, v = click_of(theta_v, theta_h, spec.theta0_rad)
+        except LatticeError as error:
+            raise LocalWireError(f"look: {error}") from None
+        return await self.look(u, v, **wanted)
 
     def published(self) -> News:
         """Ids of scans published from now on: `async for scan in session.published()`."""

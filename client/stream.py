@@ -44,7 +44,7 @@ class Stream:
         assert isinstance(info, m.ServerInfo)  # the order of a stream allows nothing else here
         if info.protocol != m.PROTOCOL:
             raise RemoteWireError(f"{self.url} speaks {info.protocol}, we {m.PROTOCOL}: update the older of the two")
-        await self.send(m.Hello(m.PROTOCOL, client="foveascan"))
+        await self.send(m.Hello(m.PROTOCOL, "foveascan", geometries=("cylinder", "sphere")))
         match await self.receive():
             case m.Refused(code=code, message=message), _:
                 raise RequestRefused(code, message)

@@ -1,10 +1,11 @@
-"""Triangles of any mesh, seen along rays towards the axis, as a grid.
+"""Triangles of any mesh, seen along rays towards the axis or a centre on it, as a grid.
 
 A ray of a regular grid stands at a known angle and height, so nothing has to be searched: each triangle is tried on the
 rays inside its own bounds in angle and height, and the outermost hit wins. In the vertical half plane of a ray with
 the unit vectors e = (cos a, sin a) and t = (-sin a, cos a), a corner P lies at (s, z) = (t.P, P_z); the ray meets the
 triangle where its barycentric coordinates there put (0, z_ray), at the range sum b_i (e.P_i). Corners of neighbouring
-triangles give edge functions that are exactly opposite, so no ray slips between them.
+triangles give edge functions that are exactly opposite, so no ray slips between them. From a centre it is the same with
+other coordinates: in the half plane, P lies so far across the ray and so far along it.
 
 Rays are worked off in bands of rows and triangles in batches: memory is bounded by the mesh and a batch.
 """
@@ -27,6 +28,8 @@ BATCH_TRIALS = 1 << 19
 TRIALS_MAX = 4_000_000_000
 STEP_MIN_MM = 0.001
 PIXEL_SLACK = 1e-6  # samples: a corner on a ray stays on it when rounded
+CAP_SLACK = 1e-6  # rad: the same for a cap's edge
+TINY = 1e-12
 EDGE_SLACK = 1e-4  # share of a triangle's height: the same for a ray along a free edge, in coordinates kept as float32
 
 Progress = Callable[[float], object]
@@ -50,7 +53,7 @@ class Mesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lattice:
-    """Rays at column centres and row centres, all round."""
+    """Rays at column centres and row centres, all round, level."""
 
     columns: int
     rows: int
@@ -61,8 +64,36 @@ class _Lattice:
     def angle_rad(self, column: IntArray) -> FloatArray:
         return self.theta0_rad + 2 * np.pi * (column + 0.5) / self.columns
 
-    def height_mm(self, row: IntArray) -> FloatArray:
-        return self.z_max_mm - (row.astype(np.float64) + 0.5) * self.pitch_mm
+    def bounds(self, corners: FloatArray) -> _Bounds:
+        return _bounds(corners, self)
+
+    def from_ray(self, out: FloatArray, z: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Of places at (out, z) in the ray's half plane: how far off the ray, and how far along it. [mm]"""
+        return z - (self.z_max_mm - (row.astype(np.float64) + 0.5) * self.pitch_mm), out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Star:
+    """Rays at column centres and at the polar angles of row centres, all from one point on the axis."""
+
+    columns: int
+    rows: int
+    theta0_rad: float
+    centre_mm: float
+
+    def angle_rad(self, column: IntArray) -> FloatArray:
+        return self.theta0_rad + 2 * np.pi * (column + 0.5) / self.columns
+
+    def bounds(self, corners: FloatArray) -> _Bounds:
+        return _cap_bounds(corners, self)
+
+    def from_ray(self, out: FloatArray, z: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
+        polar = np.pi * (row.astype(np.float64) + 0.5) / self.rows
+        sin, cos, up = np.sin(polar), np.cos(polar), z - self.centre_mm
+        return out * cos - up * sin, out * sin + up * cos
+
+
+_Rays = _Lattice | _Star
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,9 +138,7 @@ def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: Non
     progress : called with the share done, 0..1.
     Raises ExchangeError for a mesh that meets no ray, or needs more than TRIALS_MAX trials.
     """
-    ranges = _Lattice(spec.width, spec.height, spec.theta0_rad, spec.z_max_mm, spec.pitch_mm)
-    texel_mm = spec.height * spec.pitch_mm / spec.texture_height
-    texels = _Lattice(spec.texture_width, spec.texture_height, spec.theta0_rad, spec.z_max_mm, texel_mm)
+    ranges, texels = _rays(spec, spec.width, spec.height), _rays(spec, spec.texture_width, spec.texture_height)
     share = ranges.columns * ranges.rows / (ranges.columns * ranges.rows + texels.columns * texels.rows)
     radius_mm = np.full((spec.height, spec.width), np.nan)
     for rows, hits in _cast(mesh, ranges, lambda done: progress(share * done)):
@@ -122,6 +151,13 @@ def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: Non
     return Grid(spec, to_steps(radius_mm, spec.step_mm), texture)
 
 
+def _rays(spec: GridSpec, columns: int, rows: int) -> _Rays:
+    """The rays of one channel."""
+    if spec.geometry == "sphere":
+        return _Star(columns, rows, spec.theta0_rad, spec.z_max_mm)
+    return _Lattice(columns, rows, spec.theta0_rad, spec.z_max_mm, spec.height * spec.pitch_mm / rows)
+
+
 def to_steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
     """Ranges as steps. What is nearer to the axis than half a step stays measured, at one step."""
     try:
@@ -130,9 +166,9 @@ def to_steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
         raise ExchangeError(f"vertices: {problem}") from problem
 
 
-def _cast(mesh: Mesh, lattice: _Lattice, progress: Progress) -> Iterator[tuple[slice, _Hits]]:
+def _cast(mesh: Mesh, lattice: _Rays, progress: Progress) -> Iterator[tuple[slice, _Hits]]:
     """The rows of a lattice in bands, each with what its rays hit."""
-    bounds = _bounds(mesh.corners, lattice)
+    bounds = lattice.bounds(mesh.corners)
     trials = float(np.sum((bounds.right - bounds.left + 1.0) * np.maximum(bounds.bottom - bounds.top + 1, 0)))
     if trials > TRIALS_MAX:
         raise ExchangeError(
@@ -162,6 +198,28 @@ def _bounds(corners: FloatArray, lattice: _Lattice) -> _Bounds:
     return _Bounds(left, right, np.maximum(top, 0), np.minimum(bottom, lattice.rows - 1))
 
 
+def _cap_bounds(corners: FloatArray, star: _Star) -> _Bounds:
+    """Rays each face may meet: those into a cap round its corners, as the centre sees it."""
+    towards = corners - np.array([0.0, 0.0, star.centre_mm])
+    towards /= np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), TINY)
+    middle = towards.sum(axis=1)
+    length = np.linalg.norm(middle, axis=-1)
+    middle /= np.maximum(length, TINY)[:, None]
+    radius = np.arccos(np.clip(np.einsum("fcx,fx->fc", towards, middle).min(axis=1), -1, 1)) + CAP_SLACK
+    polar = np.arctan2(np.hypot(middle[:, 0], middle[:, 1]), middle[:, 2])
+    turn = star.columns / (2 * math.pi)
+    across = (np.arctan2(middle[:, 1], middle[:, 0]) - star.theta0_rad) * turn - 0.5
+    everything = (length < TINY) | (radius >= np.pi / 2)
+    everywhere = everything | (polar <= radius) | (np.pi - polar <= radius)
+    half = turn * np.arcsin(np.where(everywhere, 0, np.sin(radius) / np.maximum(np.sin(polar), np.sin(radius))))
+    left, right = _whole(np.stack([across - half, across + half], axis=1))
+    down = star.rows / np.pi * np.stack([polar - radius, polar + radius], axis=1) - 0.5
+    top, bottom = _whole(down)
+    left, right = np.where(everywhere, 0, left), np.where(everywhere, star.columns - 1, right)
+    top, bottom = np.where(everything, 0, np.maximum(top, 0)), np.where(everything, star.rows - 1, bottom)
+    return _Bounds(left, np.minimum(right, left + star.columns - 1), top, np.minimum(bottom, star.rows - 1))
+
+
 def _whole(places: FloatArray) -> tuple[IntArray, IntArray]:
     """First and last whole number between the corners of each face."""
     first = np.ceil(places.min(axis=1) - PIXEL_SLACK)
@@ -169,7 +227,7 @@ def _whole(places: FloatArray) -> tuple[IntArray, IntArray]:
     return first.astype(np.int64), last.astype(np.int64)
 
 
-def _hit_band(corners: FloatArray, lattice: _Lattice, bounds: _Bounds, rows: slice) -> _Hits:
+def _hit_band(corners: FloatArray, lattice: _Rays, bounds: _Bounds, rows: slice) -> _Hits:
     rays = (rows.stop - rows.start) * lattice.columns
     hits = _Hits(np.full(rays, np.nan), np.zeros(rays, np.int64), np.zeros((rays, 3)))
     top, bottom = np.maximum(bounds.top, rows.start), np.minimum(bounds.bottom, rows.stop - 1)
@@ -205,13 +263,14 @@ def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _meet(
-    corners: FloatArray, lattice: _Lattice, face: IntArray, row: IntArray, column: IntArray
+    corners: FloatArray, lattice: _Rays, face: IntArray, row: IntArray, column: IntArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Whether each ray meets its face, at what range, and with what weights of the corners."""
     angle = lattice.angle_rad(np.arange(lattice.columns))
     cos, sin = np.cos(angle)[column], np.sin(angle)[column]
     x, y, z = (corners[face, :, axis].T for axis in range(3))
-    aside, along, above = y * cos - x * sin, x * cos + y * sin, z - lattice.height_mm(row)
+    aside = y * cos - x * sin
+    above, along = lattice.from_ray(x * cos + y * sin, z, row)
     edge = np.stack([aside[i] * above[j] - aside[j] * above[i] for i, j in ((1, 2), (2, 0), (0, 1))])
     area = edge.sum(axis=0)
     flat = area == 0  # seen edge-on

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, BinaryIO
 
 from exchange.errors import ExchangeError
-from protocol.grid import Grid, ImageArray
+from protocol.grid import Geometry, Grid, ImageArray
 
 if TYPE_CHECKING:
     from exchange.mesh_file import Placing
@@ -38,11 +38,15 @@ SIZES: Mapping[str, Size] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class MeshOptions:
-    """What a mesh does not say itself. size : W, H, Wt, Ht.  placing : None: as its format demands.  See fit_spec."""
+    """What a mesh does not say itself. size : W, H, Wt, Ht.  placing : None: as its format demands.  See fit_spec.
+
+    geometry : "sphere" for a closed object, seen from a centre inside it (exchange.star).
+    """
 
     size: Size = SIZES["M"]
     placing: Placing | None = None
     theta0_rad: float = 0.0
+    geometry: Geometry = "cylinder"
 
 
 def suffix_of(name: str | Path) -> str:
@@ -110,10 +114,15 @@ def _read_mesh(
     from exchange.cast import cast_mesh, fit_spec
     from exchange.mesh_file import SUFFIXES, Placing, read_mesh
     from exchange.points import Points, bin_points
+    from exchange.star import close_mesh
 
     if path.suffix.lower() not in SUFFIXES:
         raise ExchangeError(f"no scan: expected an Echo file, .npz, {', '.join(SUFFIXES)}")
     found = read_mesh(path, options.placing or Placing(), texture)
+    if options.geometry == "sphere":
+        if isinstance(found, Points):
+            raise ExchangeError("points are not closed: a sphere is made of triangles")
+        return close_mesh(found, options.size, options.theta0_rad, progress=progress)[0]
     if isinstance(found, Points):
         size = *options.size[:2], *options.size[:2]  # a point colours one texel: more of them would be gaps
         return bin_points(found, fit_spec(found.positions, size, options.theta0_rad))

@@ -2,7 +2,8 @@
 
 Frame: the turntable's. x and y across, z up along the axis, millimetres; triangles wind counter-clockwise seen from
 outside. The grid is cyclic: the last column is joined to the first. A quad with four measured corners becomes two
-triangles along the diagonal that differs less in range, one with three becomes one, any other is a hole.
+triangles along the diagonal that differs less in range, one with three becomes one, any other is a hole. On a
+sphere the first and the last row are closed over their pole, if all of the row is measured.
 
 Texture coordinates (u, v) have v = 0 at the texture's top edge and u = 0 at its left edge, so a texel's centre is half
 a texel in, as in protocol/grid.py: u = (column + 0.5) / W. At the seam u runs on past 1 and needs a repeating sampler.
@@ -64,7 +65,9 @@ class GridMesh:
             per_row += grid.range_steps[:, 0] != VOID
         self._row_start = np.concatenate([[0], np.cumsum(per_row)])
         self.vertices = int(self._row_start[-1])
+        self._sin_v, self._cos_v = _polar(grid)
         self.faces = sum(int(np.count_nonzero(self._triangles(band))) for band in self._quad_bands())
+        self.faces += sum(len(lid) for lid in self._lids())
         if not self.faces:
             raise ExchangeError("nothing is measured that spans a surface")
 
@@ -77,13 +80,17 @@ class GridMesh:
         rows, columns = self._measured(band)
         spec = self.grid.spec
         radius = self.grid.range_steps[rows, self._columns[columns]] * spec.step_mm
-        return np.stack([radius * self._cos[columns], radius * self._sin[columns], spec.height_mm(rows)], axis=1)
+        if spec.geometry == "cylinder":
+            return np.stack([radius * self._cos[columns], radius * self._sin[columns], spec.height_mm(rows)], axis=1)
+        out, up = radius * self._sin_v[rows], spec.z_max_mm + radius * self._cos_v[rows]
+        return np.stack([out * self._cos[columns], out * self._sin[columns], up], axis=1)
 
     def normals(self, band: Band) -> Float32Array:
         """Unit normals of a band's vertices, outward, from the slopes towards measured neighbours. (n, 3)
 
         With the unit vectors e_r, e_a, e_z of the cylinder and r = r(a, z) the surface's normal is
-        r e_r - (dr/da) e_a - r (dr/dz) e_z.
+        r e_r - (dr/da) e_a - r (dr/dz) e_z. With those of the sphere, e_v downwards, and r = r(a, v) it is
+        r e_r - (dr/da) / sin v e_a - (dr/dv) e_v.
         """
         spec, steps = self.grid.spec, self.grid.range_steps
         low, high = max(band.first - 1, 0), min(band.end + 1, spec.height)
@@ -93,10 +100,15 @@ class GridMesh:
         turn = 2 * np.pi / spec.width
         around = _slope(np.roll(radius, 1, 1), radius, np.roll(radius, -1, 1), turn)[core]
         padded = np.pad(radius, ((1, 1), (0, 0)))
-        down = _slope(padded[:-2], radius, padded[2:], spec.pitch_mm)[core]
+        sphere = spec.geometry == "sphere"
+        down = _slope(padded[:-2], radius, padded[2:], np.pi / spec.height if sphere else spec.pitch_mm)[core]
         rows, columns = np.nonzero(measured[core][:, self._columns])
         at = rows, self._columns[columns]
         out, across, up = radius[core][at], -around[at], radius[core][at] * down[at]
+        if sphere:
+            sin_v, cos_v = (of[rows + band.first].astype(np.float32) for of in (self._sin_v, self._cos_v))
+            across /= sin_v
+            out, up = out * sin_v - down[at] * cos_v, out * cos_v + down[at] * sin_v
         cos, sin = self._cos[columns], self._sin[columns]
         normal = np.stack([out * cos - across * sin, out * sin + across * cos, up], axis=1)
         unit: Float32Array = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
@@ -119,12 +131,26 @@ class GridMesh:
         """All faces in order, as vertex numbers. (m, 3) each"""
         for band in self._quad_bands():
             yield self._number(band)[self._corners(band)]
+        yield from self._lids()
 
     def triangle_bands(self) -> Iterator[FloatArray]:
         """All faces in order, as corners. (m, 3, 3) each: face, corner, xyz [mm]"""
         for band in self._quad_bands():
             numbers = self._number(band)[self._corners(band)] - self._row_start[band.first]
             yield self.positions(band)[numbers]
+        for lid in self._lids():
+            band = Band(0, 1) if lid[0, 0] == 0 else Band(self.grid.spec.height - 1, self.grid.spec.height)
+            yield self.positions(band)[lid - self._row_start[band.first]]
+
+    def _lids(self) -> Iterator[IntArray]:
+        """The triangles that close a sphere's measured first and last rows over the poles, as vertex numbers. (m, 3)"""
+        spec = self.grid.spec
+        if spec.geometry == "cylinder":
+            return
+        fan = np.arange(1, spec.width - 1)
+        for row, after, before in ((0, 0, 1), (spec.height - 1, 1, 0)):
+            if self.grid.range_steps[row].all():
+                yield self._row_start[row] + np.stack([0 * fan, fan + after, fan + before], axis=1)
 
     def _measured(self, band: Band) -> tuple[IntArray, IntArray]:
         """Row and column (of ours) of each vertex in a band."""
@@ -189,6 +215,12 @@ def sample_lattice(texture: ImageArray, u: FloatArray, v: FloatArray) -> ImageAr
 def _blend(first: NDArray[Any], second: NDArray[Any], weight: Float32Array) -> Float32Array:
     blended: Float32Array = first.astype(np.float32) * (1 - weight) + second.astype(np.float32) * weight
     return blended
+
+
+def _polar(grid: Grid) -> tuple[FloatArray, FloatArray]:
+    """Sine and cosine of the rows' polar angles, of a sphere. (H,) each"""
+    polar = np.pi * (np.arange(grid.spec.height) + 0.5) / grid.spec.height
+    return np.sin(polar), np.cos(polar)
 
 
 def _slope(before: Float32Array, here: Float32Array, after: Float32Array, spacing: float) -> Float32Array:

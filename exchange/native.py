@@ -5,6 +5,7 @@
     z_min_mm, z_max_mm  bottom edge of the last row, top edge of row 0
     theta0_rad  angle of the left edge of column 0
     pitch_mm    height of a row, exactly; optional: (z_max_mm - z_min_mm) / H, which may be off by a rounding
+    geometry    "sphere" for directions from a centre at z_max_mm on the axis, rings thinned; optional: "cylinder"
 
 The keys are those of make_cyl.py. What a member says of its shape is checked before anything is allocated.
 """
@@ -20,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exchange.errors import ExchangeError
-from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Grid, GridSpec, ImageArray
+from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Geometry, Grid, GridSpec, ImageArray
+from protocol.rings import thin_rings
 
 NAME_MAX = 200
 MEMBERS_MAX = 64
@@ -32,6 +34,7 @@ Shape = tuple[int, ...]
 def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
     """Write a grid so that `read_native` gives the very same one."""
     spec = grid.spec
+    geometry: dict[str, Any] = {} if spec.geometry == "cylinder" else {"geometry": np.str_(spec.geometry)}
     np.savez(
         file,
         depth_u16=np.asarray(grid.range_steps, "<u2"),
@@ -42,6 +45,7 @@ def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
         theta0_rad=np.float64(spec.theta0_rad),
         pitch_mm=np.float64(spec.pitch_mm),
         name=np.str_(name[:NAME_MAX]),
+        **geometry,
     )
 
 
@@ -114,7 +118,10 @@ def _read(members: _Members, texture: ImageArray | None) -> tuple[str, Grid]:
     depth = members.array("depth_u16", 2, np.uint16).astype(np.uint16, copy=False)
     texels: ImageArray = members.array("texture", 3, np.uint8) if texture is None else texture
     try:
-        return _name(members), Grid(_spec(members, depth.shape, texels.shape), depth, texels)
+        spec = _spec(members, depth.shape, texels.shape)
+        if spec.geometry == "sphere" and not np.array_equal(depth, thin_rings(depth)):
+            raise ExchangeError("depth_u16: a sphere's rings near the poles must be thinned (protocol/rings.py)")
+        return _name(members), Grid(spec, depth, texels)
     except ValueError as problem:
         raise ExchangeError(str(problem)) from problem
 
@@ -127,7 +134,17 @@ def _spec(members: _Members, depth: Shape, texture: Shape) -> GridSpec:
         if abs(pitch_mm - between_mm) > PITCH_TOLERANCE * max(abs(z_min_mm), abs(z_max_mm), 1):
             raise ExchangeError(f"pitch_mm: {pitch_mm} contradicts z_min_mm and z_max_mm, which give {between_mm}")
     step_mm, theta0_rad = members.number("scale_mm"), members.number("theta0_rad")
-    return GridSpec(depth[1], depth[0], texture[1], texture[0], step_mm, pitch_mm, z_max_mm, theta0_rad)
+    shape = depth[1], depth[0], texture[1], texture[0]
+    return GridSpec(*shape, step_mm, pitch_mm, z_max_mm, theta0_rad, _geometry(members))
+
+
+def _geometry(members: _Members) -> Geometry:
+    if "geometry" not in members:
+        return "cylinder"
+    geometry = str(members.array("geometry", 0, np.str_))
+    if geometry not in ("cylinder", "sphere"):
+        raise ExchangeError(f"geometry: cylinder or sphere, not {geometry[:NAME_MAX]!r}")
+    return geometry  # type: ignore[return-value]  # one of the two, as just checked
 
 
 def _name(members: _Members) -> str:

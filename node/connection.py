@@ -26,6 +26,7 @@ from node.live import Live, Place
 from node.rate import RateControl
 from protocol import messages as m
 from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
+from protocol.grid import Geometry
 from protocol.live import LiveColumns
 from protocol.session import Phase, Role, Session
 
@@ -62,6 +63,7 @@ class Connection:
         self._session = Session(Role.NODE)
         self._rate = RateControl(cold_start_bytes_s)
         self._codecs: tuple[m.CodecName, ...] = ("htj2k",)
+        self._geometries: tuple[Geometry, ...] = ()
         self._bound: Bound | None = None
         self._epoch = 0
         self._opens: deque[m.Open] = deque()
@@ -119,7 +121,7 @@ class Connection:
         if message.protocol != m.PROTOCOL:
             await self._send(m.Refused(0, "bad request", f"this node speaks {m.PROTOCOL}"))
             return False
-        self._codecs = message.codecs
+        self._codecs, self._geometries = message.codecs, message.geometries
         assert self.login.role is not None  # Auth.admit lets nobody else come here
         await self._send(m.Welcome(self.login.role))
         return True
@@ -224,6 +226,8 @@ class Connection:
     async def _open(self, wanted: m.Open) -> None:
         try:
             scan, view = await self._exhibits.open(wanted.scan, self._codecs[0], wanted.profile)
+            if scan.spec.geometry not in self._geometries:
+                raise LibraryError(f"scan {scan.id} is a {scan.spec.geometry}, which this client cannot show")
             self._epoch = (self._epoch + 1) & 0xFFFF
             bound = Bound(self._epoch, scan, view.state.copy())
             if wanted.holdings is not None:

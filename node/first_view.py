@@ -83,7 +83,7 @@ def scan_info(scan: Scan) -> ScanInfo:
         coarse_width=coarse.range_steps.shape[1], coarse_height=coarse.range_steps.shape[0],
         coarse_texture_width=coarse.texture.shape[1], coarse_texture_height=coarse.texture.shape[0],
         step_mm=s.step_mm, pitch_mm=s.pitch_mm, z_max_mm=s.z_max_mm, theta0_rad=s.theta0_rad,
-        created=_utc(scan.about.created_unix_s),
+        created=_utc(scan.about.created_unix_s), geometry=s.geometry,
     )  # fmt: skip
 
 

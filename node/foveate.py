@@ -52,7 +52,8 @@ from node.texture_model import Expected, TextureModel
 from protocol.grid import RANGE_BLOCK
 from protocol.lattice import Channel, Parameters
 from protocol.messages import CodecName, Look, RangeParameters, TextureParameters
-from protocol.region import Region, region_round
+from protocol.region import Region
+from protocol.sphere import region_on
 
 REPLY_BYTES = 220  # the Updated message that ends an update, carrier included
 RANGE_OVERHEAD_BYTES = wire_overhead(Parameters(2, 0, 0, 1, 1)) + 64  # a void mask included
@@ -154,8 +155,8 @@ class _Planner:
         self._texture_db: float | None = None
         s = scan.spec
         window = look.window if look.scale is None else look.scale**2
-        self._range_region = region_round(look.u, look.v, window, s.width, s.height)
-        self._texture_region = region_round(look.u, look.v, window, s.texture_width, s.texture_height)
+        self._range_region = region_on(s, look.u, look.v, window, s.width, s.height)
+        self._texture_region = region_on(s, look.u, look.v, window, s.texture_width, s.texture_height)
         self._target_steps = look.range_mm / s.step_mm
         self._target_mse = mse_of_db(look.texture_db)
 

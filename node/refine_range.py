@@ -16,11 +16,11 @@ from node.library import Scan
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
-from protocol.codec_lift import encode_and_decode, survey
 from protocol.grid import RANGE_BLOCK, VOID, BoolArray, StepArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import Channel, Lattice, Parameters, build_lattice
 from protocol.messages import RangeParameters
+from protocol.range_payload import encode_selection, survey_selection
 from protocol.reconstruct import Selection, content_hashes, cut, range_patch, select
 from protocol.region import Region
 
@@ -75,7 +75,7 @@ def code_range_lattice(scan: Scan, state: ClientState, parameters: Parameters, q
         return None
     selection, adopted, quantum = found
     samples, seen = range_samples(scan, selection)
-    payload, decoded = encode_and_decode(samples, quantum, seen)
+    payload, decoded = encode_selection(selection, samples, quantum, seen)
     mask = encode_mask(void_cells(scan, selection))
     return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, mask, decoded)
 
@@ -109,7 +109,7 @@ def select_range_lattice(
 def expected_range_bytes(scan: Scan, selection: Selection, quantum: int) -> float:
     """About how many bytes a selection's payload takes."""
     samples, seen = range_samples(scan, selection)
-    return survey(samples, quantum, seen)[1]
+    return survey_selection(selection, samples, quantum, seen)[1]
 
 
 def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
@@ -162,7 +162,7 @@ class _Trial:
 
     def _measure(self, quantum: int) -> tuple[float, float]:
         if quantum not in self._known:
-            samples, size_bytes = survey(self._samples, quantum, self._seen)
+            samples, size_bytes = survey_selection(self._selection, self._samples, quantum, self._seen)
             patch = range_patch(self._selection, samples)[self._place]
             error = np.abs(patch[self._measured].astype(np.int32) - self._truth)
             self._known[quantum] = percentile_higher(error, PERCENTILE) if error.size else 0.0, size_bytes

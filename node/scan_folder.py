@@ -17,7 +17,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import msgspec
@@ -92,10 +92,18 @@ class _Version(msgspec.Struct, frozen=True):
 def content_id(grid: Grid) -> str:
     """Name of a grid: 32 hexadecimal digits, the first half of SHA-256 over its geometry and samples."""
     digest = hashlib.sha256(b"foveascan scan 1\n")
-    digest.update(msgspec.json.encode(grid.spec))
+    digest.update(_spec_json(grid.spec))
     digest.update(np.ascontiguousarray(grid.range_steps, "<u2").data)
     digest.update(np.ascontiguousarray(grid.texture).data)
     return digest.hexdigest()[:32]
+
+
+def _spec_json(spec: GridSpec) -> bytes:
+    """A geometry as its hash knows it: a cylinder is not named, as it was the only one once."""
+    fields = asdict(spec)
+    if spec.geometry == "cylinder":
+        del fields["geometry"]
+    return msgspec.json.encode(fields)
 
 
 def read_record(folder: Path) -> Record:

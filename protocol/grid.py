@@ -1,15 +1,17 @@
-"""A scan as regular grids round the turntable's axis: its geometry, its samples, its void rule.
+"""A scan as regular grids round the turntable's axis, or round a point: its geometry, its samples, its void rule.
 
 Range is the distance from the axis. In memory that leaves the process and on every wire it is whole steps in uint16,
 0 where nothing was measured; as millimetres it is float32 with NaN there. Row 0 is the top. Column c stands at angle
 `theta0 + 2 pi (c + 0.5) / W`, counter-clockwise seen from above, and is cyclic; row r at `z_max - (r + 0.5) * pitch`.
-The texture shares that frame at its own resolution.
+The texture shares that frame at its own resolution. A spherical scan has the same two grids over directions instead of
+places: range is the distance from a centre on the axis, and rows are polar angles (protocol.sphere).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ HEIGHT_MAX = 16384
 RANGE_BLOCK = 8
 TEXTURE_BLOCK = 16
 
+Geometry = Literal["cylinder", "sphere"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 StepArray = NDArray[np.uint16]
@@ -35,6 +38,8 @@ class GridSpec:
     width, height : range columns W and rows H.       texture_width, texture_height : texels Wt and Ht.
     step_mm : range of one step.                      pitch_mm : height of one range row.
     z_max_mm : height of the top edge of row 0.       theta0_rad : angle of the left edge of column 0.
+    geometry : a sphere's rows are polar angles; its pitch_mm is what one is wide on the object, about, and its z_max_mm
+    the height of the centre.
     Raises ValueError when a shape or a length is out of bounds.
     """
 
@@ -46,6 +51,7 @@ class GridSpec:
     pitch_mm: float
     z_max_mm: float = 0.0
     theta0_rad: float = 0.0
+    geometry: Geometry = "cylinder"
 
     def __post_init__(self) -> None:
         for name in ("width", "texture_width"):
@@ -62,7 +68,7 @@ class GridSpec:
         return self.theta0_rad + 2 * np.pi * (np.asarray(column, np.float64) + 0.5) / self.width
 
     def height_mm(self, row: FloatArray | IntArray) -> FloatArray:
-        """Height of range rows (any shape). [mm, row 0 at the top]"""
+        """Height of a cylinder's range rows (any shape). [mm, row 0 at the top]"""
         return self.z_max_mm - (np.asarray(row, np.float64) + 0.5) * self.pitch_mm
 
     def cell_at(self, u: float, v: float) -> tuple[int, int]:

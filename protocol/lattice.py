@@ -38,6 +38,7 @@ class ChannelShape:
     """One channel of a scan, as far as lattices and holdings are concerned.
 
     width, height : dense samples.  coarse_width, coarse_height : samples of the first view.  block : side of a block.
+    sphere : rows are directions' polar angles; rings of range near the poles are thinned (protocol.rings).
     """
 
     channel: Channel
@@ -45,6 +46,7 @@ class ChannelShape:
     height: int
     coarse_width: int
     coarse_height: int
+    sphere: bool = False
 
     def __post_init__(self) -> None:
         if not (1 <= self.coarse_width <= self.width and 1 <= self.coarse_height <= self.height):
@@ -77,10 +79,11 @@ def channel_shapes(
     spec: GridSpec, coarse_range: tuple[int, int], coarse_texture: tuple[int, int]
 ) -> dict[Channel, ChannelShape]:
     """Shapes of both channels of a scan; coarse shapes are (rows, columns)."""
+    sphere = spec.geometry == "sphere"
     return {
-        Channel.RANGE: ChannelShape(Channel.RANGE, spec.width, spec.height, coarse_range[1], coarse_range[0]),
+        Channel.RANGE: ChannelShape(Channel.RANGE, spec.width, spec.height, coarse_range[1], coarse_range[0], sphere),
         Channel.TEXTURE: ChannelShape(
-            Channel.TEXTURE, spec.texture_width, spec.texture_height, coarse_texture[1], coarse_texture[0]
+            Channel.TEXTURE, spec.texture_width, spec.texture_height, coarse_texture[1], coarse_texture[0], sphere
         ),
     }
 
@@ -223,7 +226,7 @@ def _axis_x(shape: ChannelShape, p: Parameters) -> Axis:
     steps = _half_steps(shape, p.half_spacing, p.rho_x, width, shape.coarse_width)
     border = _grow_both(plateau, steps, 2 * (width - 1))
     at = _positions(shape, border)
-    return _cover(at, np.arange(at.size), border, _turns(shape, (-1, 0, 1)))
+    return _cover(at, np.arange(at.size), border, _turns(shape, (-1, 0, 1)), _past(shape))
 
 
 def _axis_y(shape: ChannelShape, p: Parameters) -> Axis:
@@ -288,7 +291,12 @@ def _ring(shape: ChannelShape, half_spacing: int) -> Axis:
     count, turn = at.size, QUARTERS * shape.width
     sample = np.concatenate([[count - 1], np.arange(count), [0]])
     at = np.concatenate([[at[-1] - turn], at, [at[0] + turn]])
-    return _cover(at, sample, border, _turns(shape, (0,)))
+    return _cover(at, sample, border, _turns(shape, (0,)), _past(shape))
+
+
+def _past(shape: ChannelShape) -> int:
+    """How far a block's stencil reaches to the right: to its last sample, or on a thinned ring to the next block's."""
+    return 0 if shape.sphere and shape.channel is Channel.RANGE else 1
 
 
 def _repeat_edges(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[IntArray, IntArray]:
@@ -314,11 +322,16 @@ def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) 
     return np.tile(index, len(turns)), np.tile(start, len(turns)) + offset, np.tile(stop, len(turns)) + offset
 
 
-def _cover(at: IntArray, sample: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray]) -> Axis:
-    """Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches."""
+def _cover(
+    at: IntArray, sample: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray], short: int = 1
+) -> Axis:
+    """Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches.
+
+    short : by how much the stencil ends before the next block.
+    """
     index, start, stop = blocks
     first = np.searchsorted(at, QUARTERS * start, side="right") - 1
-    last = np.searchsorted(at, QUARTERS * (stop - 1), side="left")
+    last = np.searchsorted(at, QUARTERS * (stop - short), side="left")
     inside = (first >= 0) & (last < at.size)
     index, start, stop, first, last = (a[inside] for a in (index, start, stop, first, last))
     count = int(sample.max()) + 1

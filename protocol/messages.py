@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from protocol.errors import LocalWireError, RemoteWireError
-from protocol.grid import HEIGHT_MAX, WIDTH_MAX, GridSpec
+from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Geometry, GridSpec
 from protocol.lattice import Channel, ChannelShape, channel_shapes
 
 PROTOCOL = "foveascan.v1"
@@ -79,6 +79,7 @@ class _Message(_Part, frozen=True, tag_field="type", tag=lambda name: name[0].lo
 class ScanInfo(_Part, frozen=True):
     """What a client must know of a scan before its first view. Lengths in mm, angle in rad.
 
+    geometry : "sphere": rows are directions from a centre, at z_max_mm on the axis (protocol.sphere).
     profile : how it is refined, which decides the first view too.
     """
 
@@ -96,7 +97,7 @@ class ScanInfo(_Part, frozen=True):
     z_max_mm: float
     theta0_rad: float
     created: ShortText = ""
-    geometry: Literal["cylinder"] = "cylinder"
+    geometry: Geometry = "cylinder"
     profile: Profile = "default"
 
     def spec(self) -> GridSpec:
@@ -104,7 +105,7 @@ class ScanInfo(_Part, frozen=True):
         try:
             return GridSpec(
                 self.width, self.height, self.texture_width, self.texture_height,
-                self.step_mm, self.pitch_mm, self.z_max_mm, self.theta0_rad,
+                self.step_mm, self.pitch_mm, self.z_max_mm, self.theta0_rad, self.geometry,
             )  # fmt: skip
         except ValueError as error:
             raise RemoteWireError(f"scan {self.id}: {error}") from None
@@ -278,11 +279,15 @@ class Goodbye(_Message, frozen=True):
 
 
 class Hello(_Message, frozen=True):
-    """The client presents itself. codecs: texture codecs it decodes, the one it likes best first."""
+    """The client presents itself. codecs: texture codecs it decodes, the one it likes best first.
+
+    geometries : of scans it can show; it may open no other.
+    """
 
     protocol: ShortText
     client: ShortText = ""
     codecs: Annotated[tuple[CodecName, ...], Meta(min_length=1, max_length=8)] = ("htj2k", "jpeg")
+    geometries: Annotated[tuple[Geometry, ...], Meta(min_length=1, max_length=8)] = ("cylinder",)
 
 
 class Statement(_Part, frozen=True):

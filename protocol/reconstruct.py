@@ -21,6 +21,7 @@ from protocol.errors import LatticeError
 from protocol.grid import VOID, BoolArray, FloatArray, ImageArray, IntArray, StepArray
 from protocol.holdings import ChannelHoldings, HashArray, hash_blocks
 from protocol.lattice import QUARTERS, Axis, ChannelShape, Lattice
+from protocol.rings import ring_strides
 
 Number = TypeVar("Number", bound=np.number[Any])
 BAND_ROWS = 256
@@ -35,6 +36,7 @@ class Window:
     sample : (n,) int64 the lattice's samples that travel, ascending.
     low, high : (cells,) int64 for each dense position, the two transmitted samples beside it ...
     part, whole : (cells,) int64 ... and its place between them, part / whole.
+    at, local : (m,) int64 the stencil's positions, ascending, in quarter samples, and which of `sample` stands at each.
     """
 
     block: IntArray
@@ -45,6 +47,8 @@ class Window:
     high: IntArray
     part: IntArray
     whole: IntArray
+    at: IntArray
+    local: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +123,7 @@ def _window(axis: Axis, begin: int, end: int) -> Window:
         low, high = local[index], local[index + 1]
         part, whole = position - at[index], at[index + 1] - at[index]
     size = axis.stop[begin:end] - axis.start[begin:end]
-    return Window(axis.block[begin:end], size, start, sample, low, high, part, whole)
+    return Window(axis.block[begin:end], size, start, sample, low, high, part, whole, at, local)
 
 
 def _numbered(sample: IntArray) -> tuple[IntArray, IntArray]:
@@ -141,6 +145,57 @@ def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
     _check_samples(selection, range_steps.shape)
     columns = _blend(range_steps.T.astype(np.float64), x).T
     return _round_ratio(_blend(columns, y), np.multiply.outer(y.whole.astype(np.float64), x.whole))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ring:
+    """How the transmitted samples of a thinned row hang on the kept ones: (n,) int64 each, kept where part is 0.
+
+    row : which of the selection's sample rows it is about.
+    """
+
+    row: IntArray
+    low: IntArray
+    high: IntArray
+    part: IntArray
+    whole: IntArray
+
+
+def thinned_rings(selection: Selection) -> list[Ring]:
+    """The rows of a spherical selection that keep fewer samples than they have, by how few (REQUIREMENTS F-17).
+
+    In a row of stride s the first lattice sample of each s dense columns is kept, and the outermost ones.
+    """
+    shape, window = selection.lattice.shape, selection.x
+    if not shape.sphere:
+        return []
+    rows = selection.lattice.y.border[selection.y.sample] // 2
+    stride = ring_strides(shape.width, shape.height, selection.lattice.parameters.half_spacing)[rows]
+    rings = []
+    own = max(selection.lattice.parameters.half_spacing // 2, 1)
+    for s in np.unique(stride[stride > own]).tolist():
+        cell = window.at // (QUARTERS * s)
+        kept = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1) != 0)
+        kept = np.union1d(kept, [window.at.size - 1])
+        left = np.searchsorted(kept, np.arange(window.at.size), side="right") - 1
+        right = np.minimum(left + 1, kept.size - 1)
+        low, high = kept[left], kept[right]
+        _, first = np.unique(window.local, return_index=True)
+        whole = np.maximum(window.at[high] - window.at[low], 1)
+        part = window.at - window.at[low]
+        chosen = (window.local[low], window.local[high], part, whole)
+        rings.append(Ring(np.flatnonzero(stride == s), *(values[first] for values in chosen)))
+    return rings
+
+
+def fill_rings(selection: Selection, range_steps: StepArray) -> StepArray:
+    """Transmitted samples with those between kept ones interpolated, (2 n + d) // (2 d). sample_shape uint16."""
+    filled = range_steps.copy()
+    for ring in thinned_rings(selection):
+        rows = range_steps[ring.row].astype(np.int64)
+        mixed = rows[:, ring.low] * (ring.whole - ring.part) + rows[:, ring.high] * ring.part
+        filled[ring.row] = (2 * mixed + ring.whole) // (2 * ring.whole)
+    return filled
 
 
 def _blend(samples: FloatArray, window: Window) -> FloatArray:

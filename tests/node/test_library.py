@@ -2,6 +2,7 @@ import json
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,8 +94,22 @@ def test_the_id_tells_any_change_of_samples_or_geometry() -> None:
         Grid(SPEC, grid.range_steps, other_texture),
         Grid(other_spec, grid.range_steps, grid.texture),
     ]
-    assert len({content_id(g) for g in grids}) == 4
+    grids.append(Grid(replace(SPEC, geometry="sphere"), grid.range_steps, grid.texture))
+    assert len({content_id(g) for g in grids}) == 5
     assert content_id(Grid(SPEC, np.asfortranarray(grid.range_steps), grid.texture)) == content_id(grid)
+
+
+def test_a_cylinders_id_is_what_it_was_before_there_were_spheres() -> None:
+    spec = GridSpec(8, 2, 16, 2, step_mm=0.05, pitch_mm=1.0)
+    grid = Grid(spec, np.arange(16, dtype=np.uint16).reshape(2, 8), np.zeros((2, 16, 3), np.uint8))
+    assert content_id(grid) == "a720f80d2fff05eaaabc107be9b2e809"
+
+
+def test_a_sphere_is_kept_as_one(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    grid = _grid(0)
+    scan = library.add(Grid(replace(SPEC, geometry="sphere"), grid.range_steps, grid.texture), ABOUT)
+    assert _reopened(library).open(scan.id).spec.geometry == "sphere"
 
 
 def test_scans_are_listed_newest_first_whatever_the_clock_said(tmp_path: Path) -> None:
