@@ -64,6 +64,8 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
         host, _ = _split_listen(self.listen)
         if self.insecure and not is_loopback(host):
             raise ValueError(f"insecure: without login only loopback is served, not {host}; listen on 127.0.0.1")
+        if self.shared_cache and not self.insecure:
+            raise ValueError("shared_cache: a cache in between shows scans to whoever asks; it needs insecure = true")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate: a certificate and its key come together; set both, or neither")
 

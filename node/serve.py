@@ -201,9 +201,10 @@ class NodeServer:
         codec = request.query.get("codec", "htj2k")
         if codec not in CODECS:
             raise web.HTTPBadRequest(text=f"codec must be one of {', '.join(CODECS)}")
-        _, view = await self._exhibits.open(request.match_info["scan"], cast("m.CodecName", codec))
+        scan, view = await self._exhibits.open(request.match_info["scan"], cast("m.CodecName", codec))
         body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
-        return web.Response(body=body, content_type="application/octet-stream", headers=self._shared.cache_headers)
+        headers = self._shared.cache_headers(request, scan)
+        return web.Response(body=body, content_type="application/octet-stream", headers=headers)
 
     async def _sweep(self, request: web.Request) -> web.Response:
         require(request, "operate")

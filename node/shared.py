@@ -82,10 +82,10 @@ class SharedFoveae:
         self._bodies: Once[bytes] = Once(BODIES_KEPT)
         self.encodes = 0
 
-    @property
-    def cache_headers(self) -> dict[str, str]:
-        """What says whether and how long an answer may be kept."""
-        return {"Cache-Control": f"public, max-age={MAX_AGE_S}, immutable" if self._shared_cache else "no-store"}
+    def cache_headers(self, request: web.Request, scan: Scan) -> dict[str, str]:
+        """What says how long an answer may be kept: not at all where `latest` or a shortened id was asked for."""
+        is_kept = self._shared_cache and request.match_info["scan"] == scan.id
+        return {"Cache-Control": f"public, max-age={MAX_AGE_S}, immutable" if is_kept else "no-store"}
 
     def routes(self) -> list[web.RouteDef]:
         """What to serve."""
@@ -124,7 +124,8 @@ class SharedFoveae:
         scan, view = await self._exhibits.open(request.match_info["scan"], "htj2k")
         job = partial(_encode, scan, view, request.match_info["range"], request.match_info["texture"])
         body = await self._bodies.get(request.path, partial(self._encode, job))
-        return web.Response(body=body, content_type="application/octet-stream", headers=self.cache_headers)
+        headers = self.cache_headers(request, scan)
+        return web.Response(body=body, content_type="application/octet-stream", headers=headers)
 
     async def _encode(self, job: Callable[[], bytes]) -> bytes:
         self.encodes += 1

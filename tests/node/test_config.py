@@ -94,6 +94,12 @@ def test_without_login_only_loopback_is_served(listen: str) -> None:
     assert load_config(None, {"server.listen": listen}).server.listen == listen
 
 
+def test_a_shared_cache_asks_no_one_who_they_are_so_the_node_may_not_either() -> None:
+    with pytest.raises(ConfigError, match=r"^server\.shared_cache: .*insecure"):
+        load_config(None, {"server.shared_cache": True})
+    assert load_config(None, {"server.shared_cache": True, "server.insecure": True}).server.shared_cache
+
+
 @pytest.mark.parametrize(
     ("listen", "host", "port"),
     [("127.0.0.1:0", "127.0.0.1", 0), ("[::1]:7345", "::1", 7345), ("localhost:65535", "localhost", 65535)],

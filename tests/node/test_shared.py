@@ -100,3 +100,14 @@ async def test_an_unknown_scan_and_an_old_epoch_lead_nowhere(node: Client) -> No
     assert (await node.get("/v1/scans/none/fovea?u=0.5&v=0.5")).status == 404
     *front, _, r, t = (await plan(node, "u=0.6&v=0.4")).split("/")
     assert (await node.get("/".join([*front, "00000000", r, t]))).status == 410
+
+
+async def test_what_the_latest_scan_means_is_kept_by_no_cache(node: Client) -> None:
+    scan = (await (await node.get("/v1/scans")).json())[0]["id"]
+    shared = node.node._shared.cached  # type: ignore[attr-defined]
+    cache = "public, max-age=86400, immutable" if shared else "no-store"
+    place = await plan(node, "u=0.6&v=0.4")
+    for asked in (f"/v1/scans/{scan}/coarse", place):
+        assert (await node.get(asked)).headers["Cache-Control"] == cache
+        response = await node.get(asked.replace(scan, "latest"))
+        assert (response.status, response.headers["Cache-Control"]) == (200, "no-store")

@@ -20,9 +20,9 @@ ALLOWED = {
     (Role.NODE, Phase.GREETED): {"Refused", "Goodbye"},
     (Role.NODE, Phase.WAITING): {"Welcome", "Refused", "Goodbye"},
     (Role.NODE, Phase.READY): {"Opened", "Updated", "Resync", "Published", "Refused", "Goodbye", "Refinement"}
-    | {"LiveStarted", "LiveProgress", "LiveEnded", "LiveColumns"},
+    | {"LiveStarted", "LiveProgress", "LiveEnded", "LiveColumns", "Enveloped"},
     (Role.CLIENT, Phase.GREETED): {"Hello"},
-    (Role.CLIENT, Phase.READY): {"Open", "Look", "Ack", "State", "Cancel", "Watch"},
+    (Role.CLIENT, Phase.READY): {"Open", "Look", "Ack", "State", "Cancel", "Watch", "Envelope"},
 }
 OPENING = [(Role.NODE, "ServerInfo"), (Role.CLIENT, "Hello"), (Role.NODE, "Welcome"), (Role.NODE, "Goodbye")]
 PHASES = [Phase.NEW, Phase.GREETED, Phase.WAITING, Phase.READY, Phase.CLOSED]

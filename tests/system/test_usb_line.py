@@ -6,7 +6,8 @@ import asyncio
 import json
 import os
 import subprocess
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -31,18 +32,25 @@ def _preload() -> None:
 
 
 @pytest.fixture
-def swept(tmp_path: Path) -> Swept:
+def folder() -> Iterator[Path]:
+    """A folder of a short name: umockdev puts a socket there, and a socket's path holds 107 bytes."""
+    with tempfile.TemporaryDirectory(prefix="fs-") as name:
+        yield Path(name)
+
+
+@pytest.fixture
+def swept(folder: Path) -> Swept:
     """Sweeps a generated head over a kind of line; the node, and the scan as a client fetches it."""
 
     def sweep(link: str, *simulate: str) -> tuple[RunningNode, Grid]:
-        folder = tmp_path / link
-        folder.mkdir()
+        place = folder / link
+        place.mkdir()
         with ExitStack() as stack:
-            path = ["--path", str(folder / "scanner")]
+            path = ["--path", str(place / "scanner")]
             chosen = ["--link", link, *path, "--specimen", "head", "--seed", str(SEED), *simulate]
-            node = run_line(stack, folder, *chosen)
-            asyncio.run(fetch_scan(node.url, "latest", folder / "scan.npz", moved=lambda moved, total: None))
-            with open(folder / "scan.npz", "rb") as file:
+            node = run_line(stack, place, *chosen)
+            asyncio.run(fetch_scan(node.url, "latest", place / "scan.npz", moved=lambda moved, total: None))
+            with open(place / "scan.npz", "rb") as file:
                 return node, read_native(file)[1]
 
     return sweep
@@ -65,8 +73,8 @@ def test_a_bad_usb_line_costs_the_scan_nothing(swept: Swept) -> None:  # AT-03
     assert np.array_equal(grid.texture, node.truth.texture)
 
 
-def test_the_doctor_examines_a_scanner_on_usb(tmp_path: Path) -> None:
-    with started("simulate", "--link", "usb", "--path", str(tmp_path / "usb"), "--turn", "0.2", "--json") as (_, ready):
+def test_the_doctor_examines_a_scanner_on_usb(folder: Path) -> None:
+    with started("simulate", "--link", "usb", "--path", str(folder / "usb"), "--turn", "0.2", "--json") as (_, ready):
         chosen = ("doctor", "--link", ready["path"], "--json")
         environment = {**os.environ, **ready["environment"]}
         ran = subprocess.run(
