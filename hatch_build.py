@@ -98,7 +98,7 @@ def build(viewer: Path) -> None:
     fresh.rename(viewer / "dist")
 
 
-class ViewerHook(BuildHookInterface):  # type: ignore[type-arg]
+class ViewerHook(BuildHookInterface):  # type: ignore[type-arg]  # its argument is hatchling's own business
     """Builds the page before it is packed."""
 
     PLUGIN_NAME = "custom"

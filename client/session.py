@@ -178,7 +178,7 @@ class Session:
                 scale,
                 bound,
                 None if classic else parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
-                parameters if classic else None,  # type: ignore[arg-type]
+                parameters if classic else None,  # type: ignore[arg-type]  # likewise
             )
         )
         with self._reader.looking(request) as answer:

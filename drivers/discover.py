@@ -173,7 +173,7 @@ def _usb_devices() -> list[Found]:
 
 def _text(device: Any, name: str) -> str:
     """A name the device has for itself, where it may be read."""
-    with suppress(usb.core.USBError, ValueError, NotImplementedError):
+    with suppress(usb.core.USBError, ValueError, NotImplementedError):  # not ours to open, or no such text
         return str(getattr(device, name) or "")
     return ""
 

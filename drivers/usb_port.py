@@ -33,7 +33,7 @@ _RULE = (
     'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{:04x}", ATTR{{idProduct}}=="{:04x}", MODE="0660", GROUP="foveascan"'
     " in /etc/udev/rules.d/70-foveascan.rules"
 )
-_GONE = (usb.core.USBError, NotImplementedError, ValueError)
+_GONE = (usb.core.USBError, NotImplementedError, ValueError)  # the latter two: what pyusb says of a device half gone
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +227,7 @@ class UsbPort:
 
     def _detach(self, interface: int) -> None:
         """Have the kernel's own driver let go of an interface, if it has one; it gets it back at the end."""
-        with suppress(NotImplementedError):
+        with suppress(NotImplementedError):  # a system whose kernel takes no interface has nothing to let go
             if self._device.is_kernel_driver_active(interface):
                 self._device.detach_kernel_driver(interface)
                 self._detached = interface

@@ -82,7 +82,7 @@ class _Members:
             raise ExchangeError(f"{key}: missing")
         with self._archive.open(f"{key}.npy") as member:
             try:
-                shape, fortran, found = _header(member)  # type: ignore[arg-type]
+                shape, fortran, found = _header(member)  # type: ignore[arg-type]  # numpy types a file wider than it reads
             except ValueError as problem:
                 raise ExchangeError(f"{key}: {problem}") from None
             if not issubclass(found.type, kinds) or len(shape) != dimensions:
