@@ -1,0 +1,78 @@
+import type { LinkState } from '../link.ts';
+import { strings } from '../strings.ts';
+import { h } from './dom.ts';
+
+const NOTICE_MS = 6000;
+
+export interface FrameActions {
+  retry(): void;
+  zoom(steps: number): void;
+  home(): void;
+}
+
+/** What stands round the picture: title and state of the connection above, notices and zoom buttons on it, panels beside. */
+export class Frame {
+  readonly canvas = h('canvas', { id: 'view', tabindex: 0, role: 'application', 'aria-label': strings.view.label });
+  readonly stage: HTMLElement;
+  private readonly link = h('p', { id: 'link', role: 'status' }, strings.link.connecting);
+  private readonly retry: HTMLButtonElement;
+  private readonly notice = h('p', { id: 'notice', role: 'status' });
+  private readonly hint = h('p', { id: 'hint' }, strings.view.hints.sharpen);
+  private readonly empty = h('p', { id: 'empty', hidden: true }, strings.view.empty);
+  private readonly panel = h('aside', { id: 'panel' });
+  private retryTimer: ReturnType<typeof setInterval> | undefined;
+  private noticeTimer: ReturnType<typeof setTimeout> | undefined;
+
+  constructor(root: HTMLElement, actions: FrameActions) {
+    const button = (text: string, label: string, act: () => void) =>
+      h('button', { type: 'button', class: 'secondary', 'aria-label': label, title: label, click: act }, text);
+    const zoom = h('div', { id: 'zoom' },
+      button('+', strings.view.zoomIn, () => actions.zoom(1)), button('−', strings.view.zoomOut, () => actions.zoom(-1)),
+      button('⌂', strings.view.home, () => actions.home()));
+    this.retry = h('button', { type: 'button', class: 'secondary', hidden: true, click: () => actions.retry() }, strings.link.again);
+    this.stage = h('section', { id: 'stage', 'aria-label': strings.view.label.split('.')[0]! },
+      this.canvas, this.empty, this.notice, this.hint, zoom);
+    root.append(
+      h('header', {}, h('h1', {}, strings.title), h('div', {}, this.link, this.retry)),
+      h('main', {}, this.stage, this.panel),
+    );
+  }
+
+  /** Put panels beside the picture. */
+  add(...panels: HTMLElement[]): void {
+    this.panel.append(...panels);
+  }
+
+  /** Say something for a few seconds. */
+  say(text: string): void {
+    this.notice.textContent = text;
+    clearTimeout(this.noticeTimer);
+    this.noticeTimer = setTimeout(() => (this.notice.textContent = ''), NOTICE_MS);
+  }
+
+  /** What a click does now. */
+  hintAt(tool: keyof typeof strings.view.hints): void {
+    this.hint.textContent = strings.view.hints[tool];
+  }
+
+  /** Whether to say that there is nothing to see yet. */
+  showEmpty(empty: boolean): void {
+    this.empty.hidden = !empty;
+  }
+
+  /** How the connection stands; while there is none, counts down to the next attempt. */
+  linked(link: LinkState): void {
+    clearInterval(this.retryTimer);
+    document.documentElement.dataset['link'] = link.state;
+    this.retry.hidden = link.state !== 'lost';
+    if (link.state === 'connecting') this.link.textContent = strings.link.connecting;
+    if (link.state === 'ready') this.link.textContent = strings.link.ready(link.node);
+    if (link.state !== 'lost') return;
+    const due = performance.now() + link.retryMs;
+    const count = () => {
+      this.link.textContent = strings.link.lost(link.reason, Math.max(0, Math.ceil((due - performance.now()) / 1000)));
+    };
+    count();
+    this.retryTimer = setInterval(count, 1000);
+  }
+}
