@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from aiohttp import WSMsgType, web
 
+from client import Session as ClientSession
+from client import connect
 from protocol import messages as m
 from protocol.codec import LOSSLESS, RangeCodec, TextureCodec, encode_mask, encode_range, encode_texture
 from protocol.grid import VOID, BoolArray, Grid, GridSpec, ImageArray, StepArray, dequantise, quantise
@@ -278,3 +280,19 @@ async def show_and_answer(line: Line) -> None:
         if isinstance(look, m.Look):
             fovea = planner.range_fovea(look=look.request), planner.texture_fovea(look=look.request)
             await line.say(*fovea, updated(planner, look.request, error_max_mm=0.0, texture_db=100.0))
+
+
+@asynccontextmanager
+async def session_with(script: Script, *routes: web.RouteDef) -> AsyncIterator[ClientSession]:
+    async with serving(script, *routes) as url, connect(url) as session:
+        yield session
+
+
+async def hear_look(line: Line) -> m.Look:
+    look = await line.hear()
+    assert isinstance(look, m.Look)
+    return look
+
+
+async def until_gone(line: Line) -> None:
+    await line.gone()
