@@ -38,6 +38,13 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def _require_address(text: str) -> None:
+    try:
+        ip_address(text)
+    except ValueError:
+        raise ValueError(f"trusted_proxies: expected an IP address, got {text!r}") from None
+
+
 class Capture(Struct, frozen=True, forbid_unknown_fields=True):
     """[capture]: the scanner's port."""
 
@@ -57,15 +64,18 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
     certificate: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM; none: the node makes its own
     key: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM, of the certificate
     max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
-    shared_cache: bool = False  # let caches in between keep foveae, for a day at most: only where they are yours
+    trusted_proxies: Annotated[tuple[str, ...], Meta(max_length=16)] = ()  # your addresses, believed for whom they ask
+    shared_cache: bool = False  # let a cache of yours keep foveae, for a day at most
     encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode
 
     def __post_init__(self) -> None:
         host, _ = _split_listen(self.listen)
         if self.insecure and not is_loopback(host):
             raise ValueError(f"insecure: without login only loopback is served, not {host}; listen on 127.0.0.1")
-        if self.shared_cache and not self.insecure:
-            raise ValueError("shared_cache: a cache in between shows scans to whoever asks; it needs insecure = true")
+        for proxy in self.trusted_proxies:
+            _require_address(proxy)
+        if self.shared_cache and not self.insecure and not self.trusted_proxies:
+            raise ValueError("shared_cache: say which cache may keep scans, by its address in trusted_proxies")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate: a certificate and its key come together; set both, or neither")
 

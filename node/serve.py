@@ -27,6 +27,7 @@ from node.library_routes import LibraryRoutes
 from node.live import Live
 from node.page import Page
 from node.pairing import PairingRoutes
+from node.proxy import believe
 from node.refine_texture import CODECS
 from node.shared import SharedFoveae
 from node.tls import Tls
@@ -77,10 +78,12 @@ class NodeServer:
         self._is_stopping = False
         self._tls = tls
         self._auth = Auth(access)
-        self._shared = SharedFoveae(exhibits, shared_cache=config.server.shared_cache)
+        c = config.server
+        self._shared = SharedFoveae(exhibits, shared_cache=c.shared_cache, is_open=c.insecure)
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._hanging_up: set[asyncio.Task[None]] = set()
-        self._app = web.Application(middlewares=[_explain, self._auth.admit], client_max_size=BODY_MAX_BYTES)
+        middlewares = [believe(c.trusted_proxies), _explain, self._auth.admit]
+        self._app = web.Application(middlewares=middlewares, client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.append(_harden)
         pairing = PairingRoutes(access, tls, info.id, info.name, self._expel)
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}

@@ -4,6 +4,10 @@
 What stands there never changes: refinements that say they are self-contained, of which a client adopts what is finer
 than what it holds. Requests for the same at the same time share one encode, and what was planned is kept for a while.
 
+A cache of ours asks nobody who they are. So where there are logins, it asks us before it hands out what it keeps, by
+`GET /v1/auth`; and only a cache that configuration names is told that it may keep anything, in a header that no other
+cache reads. Browsers and whatever else is in between are told to keep nothing.
+
     /v1/scans/{scan}/fovea/{epoch}/{range}/{texture}
     range    p2.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quantum        or -
     texture  p2.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quality.codec  or -
@@ -12,6 +16,7 @@ than what it holds. Requests for the same at the same time share one encode, and
 from __future__ import annotations
 
 import asyncio
+import re
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Coroutine
@@ -28,11 +33,12 @@ from node.exhibits import Exhibits
 from node.first_view import FirstView
 from node.foveate import plan_update
 from node.library import Scan
+from node.proxy import IS_PROXIED
 from node.refine_range import code_range_lattice
 from node.refine_texture import CODECS, code_texture_lattice
 from protocol import messages as m
 from protocol.codec import TextureCodec
-from protocol.errors import CodecError, LatticeError
+from protocol.errors import CodecError, LatticeError, LibraryError
 from protocol.lattice import Channel, Parameters
 
 PLANS_KEPT = 1024
@@ -40,6 +46,8 @@ BODIES_KEPT = 256
 MAX_AGE_S = 86400
 QUERY_KEYS = {"u", "v", "window", "texture_db", "range_mm", "max_bytes", "alpha", "scale", "codec"}
 NONE = "-"
+ORIGINAL_URI = "X-Original-URI"
+KEPT = re.compile(r"/v1/scans/([0-9a-f]{32})/(?:coarse|fovea/([0-9a-f]{8})/[0-9.-]+/[0-9.-]+)(?:\?[^#]*)?")
 RANGE_NUMBERS, TEXTURE_NUMBERS = 8, 9
 
 T = TypeVar("T")
@@ -72,26 +80,31 @@ class Once(Generic[T]):
 
 
 class SharedFoveae:
-    """The routes of self-contained foveae. shared_cache : whether answers may be kept by caches in between."""
+    """The routes of self-contained foveae. shared_cache : whether caches may keep answers; is_open : no logins here."""
 
-    def __init__(self, exhibits: Exhibits, *, shared_cache: bool) -> None:
+    def __init__(self, exhibits: Exhibits, *, shared_cache: bool, is_open: bool) -> None:
         self._exhibits = exhibits
         self._shared_cache = shared_cache
+        self._is_open = is_open
         self._epoch = secrets.token_hex(4)
         self._plans: Once[str] = Once(PLANS_KEPT)
         self._bodies: Once[bytes] = Once(BODIES_KEPT)
         self.encodes = 0
 
     def cache_headers(self, request: web.Request, scan: Scan) -> dict[str, str]:
-        """What says how long an answer may be kept: not at all where `latest` or a shortened id was asked for."""
-        is_kept = self._shared_cache and request.match_info["scan"] == scan.id
-        return {"Cache-Control": f"public, max-age={MAX_AGE_S}, immutable" if is_kept else "no-store"}
+        """What says who may keep an answer: nobody where `latest` or a shortened id was asked for."""
+        if not self._shared_cache or request.match_info["scan"] != scan.id:
+            return {}
+        if self._is_open:
+            return {"Cache-Control": f"public, max-age={MAX_AGE_S}, immutable"}
+        return {"X-Accel-Expires": str(MAX_AGE_S)} if request[IS_PROXIED] else {}
 
     def routes(self) -> list[web.RouteDef]:
         """What to serve."""
         return [
             web.get("/v1/scans/{scan}/fovea", self._plan),
             web.get("/v1/scans/{scan}/fovea/{epoch}/{range}/{texture}", self._serve),
+            web.get("/v1/auth", self.may_hand_out),
         ]
 
     def void(self) -> None:
@@ -99,6 +112,23 @@ class SharedFoveae:
         self._epoch = secrets.token_hex(4)
         self._plans.clear()
         self._bodies.clear()
+
+    async def may_hand_out(self, request: web.Request) -> web.Response:
+        """A cache asks, before it hands out what it keeps: whether this client may have it, and it is still true."""
+        require(request, "view")
+        if not self._stands(request.headers.get(ORIGINAL_URI, "")):
+            raise web.HTTPForbidden(text=f"{ORIGINAL_URI} names nothing that a cache may hand out")
+        return web.Response(status=204)
+
+    def _stands(self, place: str) -> bool:
+        """Whether a URL is one that we let caches keep, of a scan that was not deleted since."""
+        kept = KEPT.fullmatch(place)
+        if kept is None or kept[2] not in (None, self._epoch):
+            return False
+        try:
+            return self._exhibits.library.summary(kept[1]).id == kept[1]
+        except LibraryError:
+            return False
 
     async def _plan(self, request: web.Request) -> web.Response:
         require(request, "view")

@@ -23,6 +23,7 @@ from protocol import messages as m
 from protocol import pairing
 from tests.node.scans import make_grid
 
+ANY_PORT = Server(listen="127.0.0.1:0")
 INFO = m.ServerInfo(m.PROTOCOL, "n1", "<node & co>", "0", login=True)
 
 
@@ -57,9 +58,9 @@ class Entrance:
 
 
 @asynccontextmanager
-async def entrance(folder: Path) -> AsyncIterator[Entrance]:
+async def entrance(folder: Path, settings: Server = ANY_PORT) -> AsyncIterator[Entrance]:
     """A node without a scanner, with one scan."""
-    config = Config(server=Server(listen="127.0.0.1:0"))
+    config = Config(server=settings)
     with closing(Library(folder)) as library, closing(Exhibits(library, FIRST_VIEW_BYTES, workers=1)) as exhibits:
         scan = library.add(make_grid(40, 24), About(1e9)).id
         place = access_folder(folder)

@@ -94,10 +94,14 @@ def test_without_login_only_loopback_is_served(listen: str) -> None:
     assert load_config(None, {"server.listen": listen}).server.listen == listen
 
 
-def test_a_shared_cache_asks_no_one_who_they_are_so_the_node_may_not_either() -> None:
-    with pytest.raises(ConfigError, match=r"^server\.shared_cache: .*insecure"):
+def test_who_may_keep_scans_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"^server\.shared_cache: .*trusted_proxies"):
         load_config(None, {"server.shared_cache": True})
     assert load_config(None, {"server.shared_cache": True, "server.insecure": True}).server.shared_cache
+    mine = {"server.shared_cache": True, "server.trusted_proxies": ["127.0.0.1", "fd00::1"]}
+    assert load_config(None, mine).server.trusted_proxies == ("127.0.0.1", "fd00::1")
+    with pytest.raises(ConfigError, match=r"^server\.trusted_proxies: expected an IP address, got 'proxy'"):
+        load_config(None, {"server.trusted_proxies": ["proxy"]})
 
 
 @pytest.mark.parametrize(
