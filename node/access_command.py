@@ -8,23 +8,27 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from node.audit_command import add_audit_action, note_at_console, print_audit
+
 if TYPE_CHECKING:
     from node.access import Access
     from node.config import Config
 
-ROLES = ("view", "operate", "admin")
+ROLES = ("monitor", "view", "operate", "admin")
 
 
 def add_access_commands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `pair` and `access`."""
     pair = subparsers.add_parser("pair", help="print a code that lets one client in, on the node's machine")
     pair.add_argument("--name", required=True, help="what the client is to be called: who or where it is")
-    pair.add_argument("--role", choices=ROLES, default="view", help="look; also sweep and change; also pair (view)")
+    roles = "only the node's health; look; also sweep and change; also pair and revoke (view)"
+    pair.add_argument("--role", choices=ROLES, default="view", help=roles)
     pair.add_argument("--minutes", type=_minutes, default=10.0, metavar="M", help="how long the code is valid (10)")
+    pair.add_argument("--token", action="store_true", help="print a token instead, for a program such as Prometheus")
     _add_common(pair)
     pair.set_defaults(run=run_pair)
 
-    access = subparsers.add_parser("access", help="list who is paired, and revoke")
+    access = subparsers.add_parser("access", help="list who is paired, revoke, and read who did what")
     actions = access.add_subparsers(title="actions", metavar="ACTION", required=True)
     listing = actions.add_parser("list", help="who is paired, oldest first")
     _add_common(listing)
@@ -33,6 +37,9 @@ def add_access_commands(subparsers: argparse._SubParsersAction[argparse.Argument
     revoke.add_argument("name", help="what it was paired as")
     _add_common(revoke)
     revoke.set_defaults(run=run_revoke)
+    audit = add_audit_action(actions)
+    _add_common(audit)
+    audit.set_defaults(run=run_audit)
 
 
 def run_pair(args: argparse.Namespace) -> int:
@@ -49,7 +56,15 @@ def run_pair(args: argparse.Namespace) -> int:
     if not certificate.exists():
         raise AccessError("there is no certificate yet: start the node once, without --insecure")
     shown = certificate_fingerprint(certificate)
-    code = _access(config).offer(args.role, args.name, time.time(), 60 * args.minutes)
+    access = _access(config)
+    if args.token:
+        token = access.grant(args.role, args.name, time.time())
+        note_at_console(config, "paired", what=f"{args.name}: {args.role}")
+        said = {"token": token, "fingerprint": shown, "name": args.name, "role": args.role}
+        print(json.dumps(said) if args.json else token, flush=True)
+        return 0
+    code = access.offer(args.role, args.name, time.time(), 60 * args.minutes)
+    note_at_console(config, "code offered", what=f"{args.name}: {args.role}")
     said = {"code": code, "fingerprint": shown, "name": args.name, "role": args.role, "minutes": args.minutes}
     lines = [
         f"code         {code}   for {args.name}, role {args.role}, valid {args.minutes:g} minutes, once",
@@ -80,10 +95,18 @@ def run_revoke(args: argparse.Namespace) -> int:
     """End a login."""
     from protocol.errors import AccessError
 
-    if not _access(_config(args)).revoke(args.name):
+    config = _config(args)
+    if not _access(config).revoke(args.name):
         raise AccessError(f"nobody called {args.name!r} is paired: see foveascan access list")
+    note_at_console(config, "revoked", what=args.name)
     print(json.dumps({"revoked": args.name}) if args.json else f"{args.name} is out")
     return 0
+
+
+def run_audit(args: argparse.Namespace) -> int:
+    """Print the audit log."""
+    config = _config(args)
+    return print_audit(config, _library(config), args)
 
 
 def _config(args: argparse.Namespace) -> Config:
@@ -111,7 +134,7 @@ def _access(config: Config) -> Access:
 def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="the node's settings (TOML)")
     parser.add_argument("--library", metavar="DIR", help="the node's library; wins over the settings")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--json", action="store_true", help="print one JSON object (audit: one a line)")
 
 
 def _minutes(text: str) -> float:

@@ -2,8 +2,8 @@
 
 A login is a token (node.access), shown as `Authorization: Bearer`, as the subprotocol `foveascan.token.<token>` of a
 stream, or as a cookie that the pairing page set. Who shows none may ask what is PUBLIC and nothing else; a role that is
-more than view is asked for where the work is done, by `require`. A node with --insecure, which serves loopback only,
-lets everybody do everything.
+more than view is asked for where the work is done, by `require`; who has the role monitor may ask what is MONITORED and
+nothing else. A node with --insecure, which serves loopback only, lets everybody do everything.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 from aiohttp import web
 from aiohttp.typedefs import Handler
@@ -19,6 +21,7 @@ from yarl import URL
 
 from node.access import Access, Token
 from node.attempts import Attempts
+from node.audit import Who
 from node.config import is_loopback
 from protocol.errors import AccessError
 from protocol.pairing import Role as Role
@@ -29,10 +32,14 @@ COOKIE = "__Host-foveascan"
 SUBPROTOCOL = "foveascan.token."
 STREAM = "/v1/stream"
 PUBLIC = frozenset({"/assets/{name}", "/healthz", "/pair", "/v1/pair"})
+MONITORED = PUBLIC | {"/metrics"}
 CHALLENGE = {"WWW-Authenticate": "Bearer"}
 SAFE = frozenset({"GET", "HEAD"})
-RANK: dict[Role | None, int] = {None: -1, "view": 0, "operate": 1, "admin": 2}
+RANK: dict[Role | None, int] = {None: -1, "monitor": 0, "view": 1, "operate": 2, "admin": 3}
 WRONG_TOKENS, WITHIN_S = 20, 60.0
+
+Refusal = Literal["no token", "wrong token", "locked", "origin", "role", "code"]
+"""Why somebody was refused."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,32 +57,43 @@ EVERYBODY = Login("anybody", "admin")
 
 
 class Auth:
-    """Decides who asks. access : the tokens; None: no login is needed."""
+    """Decides who asks. access : the tokens; None: no login is needed.  refused : told of everybody turned away."""
 
-    def __init__(self, access: Access | None) -> None:
+    def __init__(
+        self,
+        access: Access | None,
+        refused: Callable[[Who, Refusal, str], object] = lambda who, why, what: None,
+    ) -> None:
         self._access = access
+        self._refused = refused
         self._wrong = Attempts(WRONG_TOKENS, WITHIN_S)
         self._at_work: dict[asyncio.Task[object], Login] = {}
 
     @web.middleware
     async def admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Give every request its login, or refuse it."""
+        request[LOGIN] = NOBODY
         self._check_origin(request)
         request[LOGIN] = login = self._identify(request)
-        route = request.match_info.route.resource
-        place = route.canonical if route else ""
+        place = place_of(request)
         if login.role is None and place == "/":
             raise web.HTTPSeeOther("/pair")
         if login.role is None and place not in PUBLIC:
+            self._refused(asker(request), "no token", f"{request.method} {place}")
             raise web.HTTPUnauthorized(text="this node wants a login: pair with it first")
         task = asyncio.current_task()
-        if task is None or place == STREAM:
-            return await handler(request)
-        self._at_work[task] = login
+        assert task is not None
+        if place != STREAM:
+            self._at_work[task] = login
         try:
+            if login.role == "monitor" and place not in MONITORED:
+                require(request, "view")
             return await handler(request)
+        except web.HTTPForbidden:
+            self._refused(asker(request), "role", f"{request.method} {place}")
+            raise
         finally:
-            del self._at_work[task]
+            self._at_work.pop(task, None)
 
     def stands(self, login: Login) -> bool:
         """Whether a login has not been revoked since; when that cannot be read, none stands."""
@@ -91,7 +109,7 @@ class Auth:
         """End the requests of those whose login was revoked. Streams are ended by the server, with a word of it."""
         for task, login in self._at_work.items():
             if not self.stands(login):
-                log.warning("ended a request of %s, whose login was revoked", login.name)
+                log.warning("ended a request whose login was revoked")
                 task.cancel()
 
     def _identify(self, request: web.Request) -> Login:
@@ -105,21 +123,41 @@ class Auth:
             return Login(token.name, token.role, token)
         address, now_s = request.remote or "", time.monotonic()
         if self._wrong.is_locked(address, now_s):
+            self._refused(Who(NOBODY.name, "", address), "locked", "too many wrong tokens")
             raise web.HTTPTooManyRequests(text="too many wrong tokens: wait a minute")
         self._wrong.failed(address, now_s)
         log.warning("a wrong or revoked token from %s", address)
+        self._refused(Who(NOBODY.name, "", address), "wrong token", "")
         return NOBODY
 
     def _check_origin(self, request: web.Request) -> None:
         """Raises 403 for what another site's page had a browser ask."""
+        if why := self._foreign(request):
+            self._refused(asker(request), "origin", why)
+            raise web.HTTPForbidden(text=why)
+
+    def _foreign(self, request: web.Request) -> str:
         own = f"{request.scheme}://{request.host}"
         origin = request.headers.get("Origin")
         if origin is None and COOKIE in request.cookies and _changes(request):
-            raise web.HTTPForbidden(text="a browser says where a request comes from, and this one does not")
+            return "a browser says where a request comes from, and this one does not"
         if origin is not None and origin != own:
-            raise web.HTTPForbidden(text="the request comes from the page of another site")
+            return "the request comes from the page of another site"
         if self._access is None and not _is_loopback_name(request.host):
-            raise web.HTTPForbidden(text="without login only requests to this very machine are answered")
+            return "without login only requests to this very machine are answered"
+        return ""
+
+
+def asker(request: web.Request) -> Who:
+    """Whoever asks, for the audit log."""
+    login = request[LOGIN]
+    return Who(login.name, login.role or "", request.remote or "")
+
+
+def place_of(request: web.Request) -> str:
+    """Which route a request takes, as README's table has it; "" for one that leads nowhere."""
+    resource = request.match_info.route.resource
+    return resource.canonical if resource else ""
 
 
 def require(request: web.Request, role: Role) -> None:

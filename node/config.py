@@ -104,6 +104,17 @@ class Library(Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(f"library.folder: {problem}; write an absolute path") from problem
 
 
+class Audit(Struct, frozen=True, forbid_unknown_fields=True):
+    """[audit]: the history of who saw, changed, exported and deleted what."""
+
+    max_mb: Annotated[int, Meta(ge=1, le=512)] = 64  # [MB] then the oldest eighth goes; about 5000 entries each
+
+    @property
+    def bytes_max(self) -> int:
+        """The same in bytes."""
+        return self.max_mb * 1_000_000
+
+
 class FirstView(Struct, frozen=True, forbid_unknown_fields=True):
     """[first_view]: the whole object at once, coarsely."""
 
@@ -134,6 +145,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     capture: Capture = Capture()
     server: Server = Server()
     library: Library = Library()
+    audit: Audit = Audit()
     first_view: FirstView = FirstView()
     planner: Planner = Planner()
     discovery: Discovery = Discovery()

@@ -17,6 +17,7 @@ from functools import partial
 
 from aiohttp import WSMsgType, web
 
+from node.audit import Audit, Who
 from node.auth import Login
 from node.bound import Bound, updated
 from node.classic_planner import ClassicUpdate
@@ -48,6 +49,8 @@ class Connection:
         self,
         socket: web.WebSocketResponse,
         login: Login,
+        audit: Audit,
+        address: str,
         exhibits: Exhibits,
         live: Live,
         info: m.ServerInfo,
@@ -55,6 +58,8 @@ class Connection:
     ) -> None:
         self._socket = socket
         self.login = login
+        self._audit = audit
+        self._who = Who(login.name, login.role or "", address)
         self._exhibits = exhibits
         self._live = live
         self._place: Place | None = None
@@ -122,7 +127,7 @@ class Connection:
             await self._send(m.Refused(0, "bad request", f"this node speaks {m.PROTOCOL}"))
             return False
         self._codecs, self._geometries = message.codecs, message.geometries
-        assert self.login.role is not None  # Auth.admit lets nobody else come here
+        assert self.login.role is not None and self.login.role != "monitor"  # Auth.admit lets nobody else come here
         await self._send(m.Welcome(self.login.role))
         return True
 
@@ -147,6 +152,8 @@ class Connection:
                     await self._send(await self._enveloped(message.request))
                 case m.Watch(live=live):
                     self._place = Place() if live else None
+                    if live:
+                        self._audit.note_seen("watched", self._who)
                     self._live_news.set()
 
     async def _enveloped(self, request: int) -> m.Enveloped | m.Refused:
@@ -236,6 +243,7 @@ class Connection:
             await self._send(m.Refused(wanted.request, "not found", str(error)[:500]))
             return
         self._bound = bound
+        self._audit.note("opened", self._who, scan=scan.id)
         self._acknowledged.clear()
         await self._send(m.Opened(wanted.request, bound.epoch, view.info))
         if wanted.holdings is not None:

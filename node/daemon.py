@@ -74,7 +74,7 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
     server = NodeServer(config, info, exhibits, live, capture, access, tls)
     host, port = await server.start()
     stack.push_async_callback(server.stop)
-    announce.append(lambda scan_id: loop.call_soon_threadsafe(server.publish, scan_id))
+    announce.append(lambda scan_id: loop.call_soon_threadsafe(server.swept, scan_id))
     if capture is not None:
         capture.start()
         stack.push_async_callback(asyncio.to_thread, capture.stop)

@@ -19,6 +19,7 @@ from aiohttp import ClientError, web
 from exchange.errors import ExchangeError
 from exchange.formats import MEDIA_TYPES, writer_of
 from exchange.native import read_native
+from node.audit_routes import SCAN
 from node.auth import require
 from node.exhibits import Exhibits
 from node.library import About, Scan
@@ -52,6 +53,7 @@ class ExchangeRoutes:
         _check_free(self._exporting)
         async with self._exporting:
             scan_id = self._exhibits.library.resolve(request.match_info["scan"])
+            request[SCAN] = scan_id
             suffix = f".{request.match_info['format']}"
             scan = await asyncio.to_thread(self._exhibits.library.open, scan_id)
             with spool(self._exhibits.library.folder) as file:
@@ -66,6 +68,7 @@ class ExchangeRoutes:
                 await _receive(request, file)
                 name, grid = await asyncio.to_thread(_read, file)
             scan = await self._keep(name, grid)
+        request[SCAN] = scan.id
         self._published(scan.id)
         return web.Response(body=msgspec.json.encode({"id": scan.id}), content_type="application/json", status=201)
 

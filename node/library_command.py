@@ -17,10 +17,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from node.audit_command import note_at_console
 from protocol.errors import LibraryError
 from protocol.printable import counted, printable
 
 if TYPE_CHECKING:
+    from node.config import Config
     from node.library import Library, ScanSummary
 
 SCAN_HELP = "the id, the beginning of one, or latest"
@@ -97,6 +99,7 @@ def run_rename(args: argparse.Namespace) -> int:
             library.rename(scan_id, args.name, getpass.getuser())
         except ValueError as problem:
             raise LibraryError(f"name: {problem}") from problem
+    note_at_console(_config(args), "changed", (scan_id,), "name")
     return _tell(args, {"id": scan_id, "name": args.name}, f'{scan_id} is called "{printable(args.name)}" now')
 
 
@@ -108,6 +111,7 @@ def run_delete(args: argparse.Namespace) -> int:
         return 1
     with _opened(folder) as library:
         library.delete(scan_id)
+    note_at_console(_config(args), "deleted", (scan_id,))
     return _tell(args, {"deleted": scan_id}, f"deleted {scan_id}")
 
 
@@ -138,6 +142,7 @@ def run_backup(args: argparse.Namespace) -> int:
     folder = _folder(args)
     ids = list(dict.fromkeys(_resolve(folder, name) for name in args.scan)) or sorted(survey(folder)[0])
     backup(folder, ids, args.file)
+    note_at_console(_config(args), "backed up", ids)
     size_bytes = args.file.stat().st_size
     said = {"file": str(args.file), "scans": len(ids), "bytes": size_bytes}
     return _tell(args, said, f"{counted(len(ids), 'scan')}, {counted(size_bytes, 'byte')} in {args.file}")
@@ -147,6 +152,7 @@ def run_restore(args: argparse.Namespace) -> int:
     """Take a backup in."""
     with _opened(_set_folder(args)) as library:
         restored = library.restore(args.file)
+    note_at_console(_config(args), "restored", restored.added)
     said = {"added": list(restored.added), "kept": list(restored.kept)}
     text = f"{counted(len(restored.added), 'scan')} restored, {len(restored.kept)} kept that were here already"
     return _tell(args, said, text)
@@ -161,9 +167,13 @@ def _folder(args: argparse.Namespace) -> Path:
 
 
 def _set_folder(args: argparse.Namespace) -> Path:
+    return _config(args).library.path
+
+
+def _config(args: argparse.Namespace) -> Config:
     from node.config import load_config
 
-    return load_config(args.config, {"library.folder": args.library}).library.path
+    return load_config(args.config, {"library.folder": args.library})
 
 
 def _resolve(folder: Path, text: str) -> str:

@@ -24,7 +24,7 @@ from protocol.errors import LibraryError
 
 FORMAT = 1
 MARK_FILE, LOCK_FILE, SWEEPS = "library.json", "lock", "sweeps"
-OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, "node-id", "access"})  # the last two: node.identity, node.access
+OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, "node-id", "access", "audit"})  # node.identity, node.access, node.audit
 TRASH, RESTORE = ".trash-", ".restore-"
 UNFINISHED = (INCOMING, TRASH, RESTORE)
 CHECKED = "checked"  # in a .restore- folder: everything in it was unpacked and found sound

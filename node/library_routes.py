@@ -24,13 +24,14 @@ from typing import BinaryIO
 import msgspec
 from aiohttp import web
 
+from node.audit_routes import SCAN, WHAT
 from node.auth import LOGIN, require
 from node.capture import Capture, CaptureStatus
 from node.durable import NoRoom
 from node.journal import Interrupted
 from node.library import Library, verify
 from node.partial import write_partial
-from node.sidecar import Conflict, Sidecar, decode_changes
+from node.sidecar import Conflict, Sidecar, changed_fields, decode_changes
 from node.spool import send, spool
 from protocol.errors import LibraryError
 
@@ -83,6 +84,7 @@ class LibraryRoutes:
         scan_id, revision = self._named(request), _revision(request)
         with _explained():
             changes = decode_changes(await request.read())
+            request[WHAT] = ", ".join(changed_fields(changes))
             by = self._who(request)[:100]
             return _said(await asyncio.to_thread(self._library.annotate, scan_id, changes, by, revision))
 
@@ -110,9 +112,11 @@ class LibraryRoutes:
     def _known(self, request: web.Request) -> str:
         """The scan that is asked for. Raises 404."""
         try:
-            return self._library.summary(self._library.resolve(request.match_info["scan"])).id
+            scan_id = self._library.summary(self._library.resolve(request.match_info["scan"])).id
         except LibraryError as error:
             raise web.HTTPNotFound(text=str(error)) from error
+        request[SCAN] = scan_id
+        return scan_id
 
     # -- sweeps ----------------------------------------------------------------------------------------------------
 

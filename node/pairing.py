@@ -25,7 +25,8 @@ from aiohttp import web
 
 from node.access import Access, Token
 from node.attempts import Attempts
-from node.auth import COOKIE, LOGIN, require
+from node.audit import NODE, Audit, Who
+from node.auth import COOKIE, Refusal, asker, require
 from node.tls import Tls
 from protocol import pairing
 from protocol.errors import AccessError, LocalWireError
@@ -66,13 +67,24 @@ class NewCode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PairingRoutes:
-    """The routes above. access, tls : None without login. revoked : called after a token was revoked."""
+    """The routes above. access, tls : None without login. audit : told who is let in and put out.
+
+    refused : told of everybody turned away.  revoked : called after a token was revoked."""
 
     def __init__(
-        self, access: Access | None, tls: Tls | None, node_id: str, name: str, revoked: Callable[[], object]
+        self,
+        access: Access | None,
+        tls: Tls | None,
+        audit: Audit,
+        refused: Callable[[Who, Refusal, str], object],
+        node_id: str,
+        name: str,
+        revoked: Callable[[], object],
     ) -> None:
         self._access = access
         self._tls = tls
+        self._audit = audit
+        self._refused = refused
         self._node_id = node_id
         self._name = name
         self._revoked = revoked
@@ -101,6 +113,7 @@ class PairingRoutes:
         by_form = request.content_type == "application/x-www-form-urlencoded"
         if self._failures.is_locked(request.remote or "", time.monotonic()):
             log.warning("pairing: %s is locked", request.remote)
+            self._refused(asker(request), "locked", "too many wrong codes")
             return self._show(LOCKED, 429) if by_form else _refusal(429, LOCKED)
         return await (self._pair_browser(request, access) if by_form else self._pair_client(request, access, tls, body))
 
@@ -140,14 +153,17 @@ class PairingRoutes:
         self._failures.failed(request.remote or "", time.monotonic())
         self._wrong_codes += 1
         log.warning("pairing: a wrong code from %s", request.remote)
+        self._refused(asker(request), "code", "")
         if self._wrong_codes >= CODE_FAILURES:
             self._wrong_codes = 0
             voided = await asyncio.to_thread(access.void_codes)
             log.warning("pairing: %d wrong codes; %d that waited are void now", CODE_FAILURES, voided)
+            self._audit.note("codes voided", NODE, what=f"{voided} after {CODE_FAILURES} wrong ones")
 
     def _paired(self, request: web.Request, token: Token) -> None:
         self._wrong_codes = 0
-        log.warning("pairing: %s paired from %s with the role %s", token.name, request.remote, token.role)
+        log.warning("pairing: a client paired from %s with the role %s", request.remote, token.role)
+        self._audit.note("paired", Who(token.name, token.role, request.remote or ""))
 
     def _show(self, trouble: str = "", status: int = 200) -> web.Response:
         _, tls = self._known()
@@ -169,7 +185,7 @@ class PairingRoutes:
             code = await asyncio.to_thread(access.offer, asked.role, asked.name, time.time())
         except AccessError as error:
             raise web.HTTPConflict(text=str(error)) from error
-        log.warning("pairing: %s offers a code for %s with the role %s", request[LOGIN].name, asked.name, asked.role)
+        self._audit.note("code offered", asker(request), what=f"{asked.name}: {asked.role}")
         return _json({"code": code, "fingerprint": tls.fingerprint}, 201)
 
     async def _tokens(self, request: web.Request) -> web.Response:
@@ -183,7 +199,7 @@ class PairingRoutes:
         name = request.match_info["name"]
         if not await asyncio.to_thread(access.revoke, name):
             raise web.HTTPNotFound(text="nobody of that name is paired")
-        log.warning("pairing: %s revoked %s", request[LOGIN].name, name)
+        self._audit.note("revoked", asker(request), what=name)
         self._revoked()
         return web.Response(status=204)
 

@@ -14,7 +14,9 @@ from aiohttp import web
 from aiohttp.typedefs import Handler
 
 from node.access import Access
-from node.auth import CHALLENGE, LOGIN, Auth, require
+from node.audit import NODE, Audit, Who
+from node.audit_routes import SCAN, AuditRoutes
+from node.auth import CHALLENGE, LOGIN, Auth, Refusal, require
 from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection
@@ -77,15 +79,18 @@ class NodeServer:
         self._capture = capture
         self._is_stopping = False
         self._tls = tls
-        self._auth = Auth(access)
+        self.audit = Audit(exhibits.library.folder, config.audit.bytes_max)
+        audit_routes = AuditRoutes(self.audit, exhibits.library.folder, config.audit.bytes_max)
+        self._auth = Auth(access, self._refused)
         c = config.server
         self._shared = SharedFoveae(exhibits, shared_cache=c.shared_cache, is_open=c.insecure)
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._hanging_up: set[asyncio.Task[None]] = set()
         middlewares = [believe(c.trusted_proxies), _explain, self._auth.admit]
         self._app = web.Application(middlewares=middlewares, client_max_size=BODY_MAX_BYTES)
-        self._app.on_response_prepare.append(_harden)
-        pairing = PairingRoutes(access, tls, info.id, info.name, self._expel)
+        self._app.on_response_prepare.extend((_harden, audit_routes.witness))
+        self._app.on_cleanup.append(self._close_audit)
+        pairing = PairingRoutes(access, tls, self.audit, self._refused, info.id, info.name, self._expel)
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
         self._app.add_routes([
             *Page().routes(),
@@ -99,6 +104,7 @@ class NodeServer:
             *self._shared.routes(),
             *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
             *pairing.routes(),
+            *audit_routes.routes(),
         ])  # fmt: skip
         self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=REQUESTS_S)
 
@@ -109,6 +115,7 @@ class NodeServer:
         site = web.TCPSite(self._runner, self._config.server.host, self._config.server.port, ssl_context=context)
         await site.start()
         self._watching = asyncio.create_task(self._watch_access())
+        self.audit.note("started", NODE, what=self._info.version)
         host, port = self._runner.addresses[0][:2]
         return str(host), int(port)
 
@@ -121,6 +128,7 @@ class NodeServer:
             await asyncio.wait(goodbyes, timeout=GOODBYE_S)
         for line in self._connections.values():
             line.abort()
+        self.audit.note("stopped", NODE)
         await self._runner.cleanup()
 
     async def _watch_access(self) -> None:
@@ -145,12 +153,24 @@ class NodeServer:
         self._auth.expel()
 
     async def _hang_up(self, connection: Connection, line: asyncio.Transport) -> None:
-        log.warning("ended a stream of %s, whose login was revoked", connection.login.name)
+        log.warning("ended a stream whose login was revoked")
         try:
             async with asyncio.timeout(GOODBYE_S):
                 await connection.close("the login was revoked")
         except TimeoutError:
             line.abort()
+
+    def _refused(self, who: Who, why: Refusal, what: str) -> None:
+        """Somebody was turned away."""
+        self.audit.refuse(who, f"{why}: {what}" if what else why)
+
+    async def _close_audit(self, app: web.Application) -> None:
+        await asyncio.to_thread(self.audit.close)
+
+    def swept(self, scan_id: str) -> None:
+        """A sweep has become a scan: note it, and tell every client."""
+        self.audit.note("scanned", NODE, scan=scan_id)
+        self.publish(scan_id)
 
     def publish(self, scan_id: str) -> None:
         """Tell every client of a new scan."""
@@ -195,6 +215,7 @@ class NodeServer:
 
     async def _scan(self, request: web.Request) -> web.Response:
         scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
+        request[SCAN] = scan.id
         quality = scan.about.quality
         said = quality and m.ScanQuality(**asdict(quality), complaints=quality.complaints)
         return _json({**msgspec.to_builtins(scan_info(scan)), "quality": said})
@@ -205,6 +226,7 @@ class NodeServer:
         if codec not in CODECS:
             raise web.HTTPBadRequest(text=f"codec must be one of {', '.join(CODECS)}")
         scan, view = await self._exhibits.open(request.match_info["scan"], cast("m.CodecName", codec))
+        request[SCAN] = scan.id
         body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
         headers = self._shared.cache_headers(request, scan)
         return web.Response(body=body, content_type="application/octet-stream", headers=headers)
@@ -229,7 +251,9 @@ class NodeServer:
             return stream
         _bound_buffers(line)
         cold_start = self._config.planner.cold_start_bytes_s
-        connection = Connection(stream, request[LOGIN], self._exhibits, self._live, self._info, cold_start)
+        connection = Connection(
+            stream, request[LOGIN], self.audit, request.remote or "", self._exhibits, self._live, self._info, cold_start
+        )
         self._connections[connection] = line
         try:
             await connection.run()

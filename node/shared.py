@@ -27,6 +27,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 from aiohttp import web
 
+from node.audit_routes import SCAN
 from node.auth import require
 from node.coded import Coded
 from node.exhibits import Exhibits
@@ -116,14 +117,15 @@ class SharedFoveae:
     async def may_hand_out(self, request: web.Request) -> web.Response:
         """A cache asks, before it hands out what it keeps: whether this client may have it, and it is still true."""
         require(request, "view")
-        if not self._stands(request.headers.get(ORIGINAL_URI, "")):
+        kept = KEPT.fullmatch(request.headers.get(ORIGINAL_URI, ""))
+        if kept is None or not self._stands(kept):
             raise web.HTTPForbidden(text=f"{ORIGINAL_URI} names nothing that a cache may hand out")
+        request[SCAN] = kept[1]
         return web.Response(status=204)
 
-    def _stands(self, place: str) -> bool:
-        """Whether a URL is one that we let caches keep, of a scan that was not deleted since."""
-        kept = KEPT.fullmatch(place)
-        if kept is None or kept[2] not in (None, self._epoch):
+    def _stands(self, kept: re.Match[str]) -> bool:
+        """Whether a URL that we let caches keep is of a scan that was not deleted since."""
+        if kept[2] not in (None, self._epoch):
             return False
         try:
             return self._exhibits.library.summary(kept[1]).id == kept[1]
@@ -152,6 +154,7 @@ class SharedFoveae:
         if request.match_info["epoch"] != self._epoch:
             raise web.HTTPGone(text="the library has changed since: ask for the place again")
         scan, view = await self._exhibits.open(request.match_info["scan"], "htj2k")
+        request[SCAN] = scan.id
         job = partial(_encode, scan, view, request.match_info["range"], request.match_info["texture"])
         body = await self._bodies.get(request.path, partial(self._encode, job))
         headers = self.cache_headers(request, scan)

@@ -97,6 +97,11 @@ def decode_changes(data: bytes) -> Changes:
         raise ValueError(str(error)) from error
 
 
+def changed_fields(changes: Changes) -> list[str]:
+    """Which fields get new values."""
+    return [name for name in Changes.__struct_fields__ if getattr(changes, name) is not UNSET]
+
+
 def read_sidecar(folder: Path) -> Sidecar:
     """What is said of the scan in a folder; nothing, where nobody has said anything. Raises LibraryError."""
     try:
@@ -140,7 +145,7 @@ def sidecar_of(history: tuple[Change, ...]) -> Sidecar:
 
 def _checked(change: Change) -> Change:
     """Bounds are checked where JSON is read, and a caller in this process may have made anything."""
-    if all(getattr(change.set, name) is UNSET for name in Changes.__struct_fields__):
+    if not changed_fields(change.set):
         raise ValueError("it changes nothing")
     try:
         return msgspec.json.decode(msgspec.json.encode(change), type=Change)

@@ -20,7 +20,7 @@ from protocol.messages import PROTOCOL
 from protocol.pairing import Role
 from tests.node.entrance import Entrance, entrance
 
-ROLES: tuple[Role | None, ...] = (None, "view", "operate", "admin")
+ROLES: tuple[Role | None, ...] = (None, "monitor", "view", "operate", "admin")
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
@@ -34,7 +34,7 @@ def table() -> dict[tuple[str, str], Role | None]:
     """Request -> the least role that may make it, as README says."""
     [text] = re.findall(r"^\| role \| may ask .*?\n\n", README, re.DOTALL | re.MULTILINE)
     found: dict[tuple[str, str], Role | None] = {}
-    for role, requests in re.findall(r"^\| (nobody|view|operate|admin) \| (.*) \|$", text, re.MULTILINE):
+    for role, requests in re.findall(r"^\| (nobody|monitor|view|operate|admin) \| (.*) \|$", text, re.MULTILINE):
         for method, path in re.findall(r"`([A-Z]+) (\S+)`", requests):
             found[method, path] = None if role == "nobody" else role
     return found

@@ -1,0 +1,97 @@
+"""A bounded history on disk: lines appended durably to private files, of which the oldest goes when they are too many.
+
+    <folder>/<name>.jsonl     the current file; .1.jsonl the one before it, and so on up to FILES - 1
+             lock             held by whoever appends: the node, and the commands beside it
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from node.durable import give_to_owner_of, sync_folder
+
+FILES = 8
+LOCK_FILE = "lock"
+LINE_BYTES_MAX = 8192
+
+
+class Trail:
+    """One history. folder : private to its owner, made if it is missing.  bytes_max : of all its files together.
+
+    Several processes may append. Methods raise OSError.
+    """
+
+    def __init__(self, folder: Path, name: str, bytes_max: int) -> None:
+        self._folder = folder
+        self._name = name
+        self._file_bytes_max = bytes_max // FILES
+
+    def append(self, lines: Sequence[bytes]) -> None:
+        """Add lines, all of them or none, durable before this returns. lines : without their ends."""
+        data = b"".join(line + b"\n" for line in lines)
+        with self._locked():
+            if self._size() and self._size() + len(data) > self._file_bytes_max:
+                self._rotate()
+            handle = os.open(self._path(0), os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                give_to_owner_of(self._folder, self._path(0))
+                _write(handle, data)
+            finally:
+                os.close(handle)
+
+    def newest_first(self) -> Iterator[bytes]:
+        """Every line, the last one first. Lines that are added meanwhile may be missing."""
+        for number in range(FILES):
+            try:
+                data = self._path(number).read_bytes()
+            except FileNotFoundError:
+                continue
+            yield from reversed(data.splitlines())
+
+    def _path(self, number: int) -> Path:
+        return self._folder / (f"{self._name}.{number}.jsonl" if number else f"{self._name}.jsonl")
+
+    def _size(self) -> int:
+        try:
+            return self._path(0).stat().st_size
+        except FileNotFoundError:
+            return 0
+
+    def _rotate(self) -> None:
+        for number in reversed(range(FILES - 1)):
+            with suppress(FileNotFoundError):
+                os.replace(self._path(number), self._path(number + 1))
+        sync_folder(self._folder)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        if not self._folder.exists():
+            self._folder.mkdir(mode=0o700, parents=True)
+            give_to_owner_of(self._folder.parent, self._folder)
+        lock = self._folder / LOCK_FILE
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            give_to_owner_of(self._folder, lock)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
+
+
+def _write(handle: int, data: bytes) -> None:
+    """Append and make durable; on a full disk nothing of it is left."""
+    size = os.fstat(handle).st_size
+    if size and os.pread(handle, 1, size - 1) != b"\n":
+        data = b"\n" + data  # a power cut tore the last line
+    try:
+        written = 0
+        while written < len(data):
+            written += os.write(handle, data[written:])
+        os.fsync(handle)
+    except OSError:
+        os.ftruncate(handle, size)
+        raise
