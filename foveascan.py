@@ -148,7 +148,7 @@ def run_demo(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that both programs are ended with the blocks below
     with TemporaryDirectory(prefix="foveascan-demo-") as folder:
         with started(*_simulate(args, f"{folder}/scanner", f"{folder}/truth.npz")) as (_, scanner):
-            with started(*_serve(scanner["path"], f"{folder}/library")) as (node, ready):
+            with started(*_serve(scanner["path"], folder)) as (node, ready):
                 quietly = ["--json"] if args.json else []
                 swept = subprocess.run(
                     [*PROGRAM, "scan", "--node", ready["url"], *quietly], stdout=sys.stderr if args.json else None
@@ -212,8 +212,11 @@ def _simulate(args: argparse.Namespace, link: str, truth: str) -> list[str]:
     return command
 
 
-def _serve(scanner: str, library: str) -> list[str]:
-    return ["serve", "--scanner", scanner, "--library", library, "--listen", "127.0.0.1:0", "--insecure", "--json"]
+def _serve(scanner: str, folder: str) -> list[str]:
+    config = Path(folder, "node.toml")
+    config.write_text("[capture]\nrepair = false\n")  # a hole in a specimen is no flaw of the camera
+    chosen = ["--config", str(config), "--library", f"{folder}/library", "--listen", "127.0.0.1:0"]
+    return ["serve", "--scanner", scanner, *chosen, "--insecure", "--json"]
 
 
 @contextmanager

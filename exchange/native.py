@@ -5,6 +5,8 @@
     z_min_mm, z_max_mm  bottom edge of the last row, top edge of row 0
     theta0_rad  angle of the left edge of column 0
     pitch_mm    height of a row, exactly; optional: (z_max_mm - z_min_mm) / H, which may be off by a rounding
+    repairs     (n, 3) int32, range cells that are not as they were measured, row by row: row, column, steps measured
+                there (0 = nothing); optional
     geometry    "sphere" for directions from a centre at z_max_mm on the axis, rings thinned; optional: "cylinder"
 
 The keys are those of make_cyl.py. What a member says of its shape is checked before anything is allocated.
@@ -21,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exchange.errors import ExchangeError
-from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Geometry, Grid, GridSpec, ImageArray
+from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Geometry, Grid, GridSpec, ImageArray, RepairArray, no_repairs
 from protocol.rings import thin_rings
 
 NAME_MAX = 200
@@ -34,7 +36,9 @@ Shape = tuple[int, ...]
 def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
     """Write a grid so that `read_native` gives the very same one."""
     spec = grid.spec
-    geometry: dict[str, Any] = {} if spec.geometry == "cylinder" else {"geometry": np.str_(spec.geometry)}
+    optional: dict[str, Any] = {} if spec.geometry == "cylinder" else {"geometry": np.str_(spec.geometry)}
+    if grid.repairs.size:
+        optional["repairs"] = np.asarray(grid.repairs, "<i4")
     np.savez(
         file,
         depth_u16=np.asarray(grid.range_steps, "<u2"),
@@ -45,7 +49,7 @@ def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
         theta0_rad=np.float64(spec.theta0_rad),
         pitch_mm=np.float64(spec.pitch_mm),
         name=np.str_(name[:NAME_MAX]),
-        **geometry,
+        **optional,
     )
 
 
@@ -121,7 +125,7 @@ def _read(members: _Members, texture: ImageArray | None) -> tuple[str, Grid]:
         spec = _spec(members, depth.shape, texels.shape)
         if spec.geometry == "sphere" and not np.array_equal(depth, thin_rings(depth)):
             raise ExchangeError("depth_u16: a sphere's rings near the poles must be thinned (protocol/rings.py)")
-        return _name(members), Grid(spec, depth, texels)
+        return _name(members), Grid(spec, depth, texels, _repairs(members))
     except ValueError as problem:
         raise ExchangeError(str(problem)) from problem
 
@@ -145,6 +149,12 @@ def _geometry(members: _Members) -> Geometry:
     if geometry not in ("cylinder", "sphere"):
         raise ExchangeError(f"geometry: cylinder or sphere, not {geometry[:NAME_MAX]!r}")
     return geometry  # type: ignore[return-value]  # one of the two, as just checked
+
+
+def _repairs(members: _Members) -> RepairArray:
+    if "repairs" not in members:
+        return no_repairs()
+    return members.array("repairs", 2, np.int32).astype(np.int32, copy=False)
 
 
 def _name(members: _Members) -> str:

@@ -32,6 +32,8 @@ from node.scan_folder import (
     RANGE_FILE,
     RECORD_BYTES_MAX,
     RECORD_FILE,
+    REPAIR_BYTES,
+    REPAIRS_FILE,
     TEXTURE_FILE,
     read_record,
     read_sound_grid,
@@ -47,9 +49,11 @@ SCANS_MAX = 100_000
 BYTES_MAX = {
     RANGE_FILE: 2 * WIDTH_MAX * HEIGHT_MAX + ARRAY_HEADER_BYTES_MAX,
     TEXTURE_FILE: 3 * WIDTH_MAX * HEIGHT_MAX + ARRAY_HEADER_BYTES_MAX,
+    REPAIRS_FILE: REPAIR_BYTES * WIDTH_MAX * HEIGHT_MAX + ARRAY_HEADER_BYTES_MAX,
     RECORD_FILE: RECORD_BYTES_MAX,
     SIDECAR_FILE: FILE_BYTES_MAX,
 }
+OPTIONAL = frozenset({REPAIRS_FILE, SIDECAR_FILE})
 _PORTION_BYTES = 1 << 20
 _BLOCK_BYTES = 512
 _MEMBER = re.compile(r"([0-9a-f]{32})/([a-z.]+)")
@@ -128,7 +132,7 @@ def _pack(folder: Path, scan_ids: list[str], file: BinaryIO) -> None:
             scan = folder / scan_id
             _check(scan, "cannot back up")
             for name in BYTES_MAX:
-                if name != SIDECAR_FILE or (scan / name).exists():
+                if name not in OPTIONAL or (scan / name).exists():
                     _pack_file(archive, f"{scan_id}/{name}", scan / name, sums)
         _pack_bytes(archive, SUMS, "".join(sums).encode(), [])
 

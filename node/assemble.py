@@ -82,10 +82,9 @@ class Encoder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assembly:
-    """A finished sweep. filled : (H, W) range cells whose value is made up, being small holes."""
+    """A finished sweep: its grid, which tells what was repaired of it, and what it is worth."""
 
     grid: Grid
-    filled: BoolArray
     quality: ScanQuality
 
 
@@ -150,25 +149,18 @@ class Assembler:
         repairs : take spikes out and fill small holes; without, every sample is one that was measured.
         """
         grid, quality = self._average()
-        if repairs:
-            repaired = repair(grid, quality.noise_mm or 0.0)
-        else:
-            repaired = Repaired(grid, np.zeros(grid.range_steps.shape, np.bool_), 0)
+        repaired = repair(grid, quality.noise_mm or 0.0) if repairs else Repaired(grid, 0, 0)
         found = survey(repaired.grid)
-        filled = int(repaired.filled.sum())
-        return Assembly(
-            repaired.grid,
-            repaired.filled,
-            replace(
-                quality,
-                coverage=coverage_of(np.where(repaired.filled, np.uint16(VOID), repaired.grid.range_steps)),
-                spikes=repaired.spikes,
-                filled=filled,
-                holes=found.holes,
-                dead_rows=found.dead_rows,
-                saturated_columns=found.saturated_columns,
-            ),
+        said = replace(
+            quality,
+            coverage=found.coverage - repaired.filled / grid.range_steps.size,
+            spikes=repaired.spikes,
+            filled=repaired.filled,
+            holes=found.holes,
+            dead_rows=found.dead_rows,
+            saturated_columns=found.saturated_columns,
         )
+        return Assembly(repaired.grid, said)
 
     def _average(self) -> tuple[Grid, ScanQuality]:
         counts = self._encoder.counts_per_turn

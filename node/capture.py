@@ -88,7 +88,7 @@ class Capture:
     watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
     SweepInterrupted for it, whatever the scanner said.
     sweeps : where columns are kept until their grid is delivered; without it, a cut sweep is lost.
-    request : how to sweep.
+    request : how to sweep.  repairs : whether spikes are taken out and small holes filled.
     """
 
     def __init__(
@@ -99,6 +99,7 @@ class Capture:
         watch: Callable[[SweepEvent], None] = lambda event: None,
         sweeps: Journals | None = None,
         request: SweepRequest = ONE_TURN,
+        repairs: bool = True,
     ) -> None:
         self._open_port = open_port
         self._config = config
@@ -106,6 +107,7 @@ class Capture:
         self._watch = watch
         self._sweeps = sweeps
         self._sweep_request = request
+        self._repairs = repairs
         self._beat_s = time.monotonic()
         self._stop = threading.Event()
         self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
@@ -234,7 +236,8 @@ class Capture:
                 case SweepRequest():
                     if self._sweeps is not None:
                         self._sweeps.require_room()
-                    self._run_sweep(scanner.sweep(order, self._stop), RunningSweep(self._sweeps, info))
+                    running = RunningSweep(self._sweeps, info, repairs=self._repairs)
+                    self._run_sweep(scanner.sweep(order, self._stop), running)
                 case _Resume():
                     self._resume(scanner, info, order)
         except LibraryError as error:
@@ -247,14 +250,14 @@ class Capture:
         self._status = replace(self._status, phase="sweeping", progress=sweep.held / sweep.expected)
         held = list(self._sweeps.columns(sweep.id))
         if sweep.is_complete:
-            publish(self._sweeps, sweep, self._deliver)
+            publish(self._sweeps, sweep, self._deliver, self._repairs)
             self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
             return
         if order.by_itself:
             events = scanner.resume(sweep.header, held, self._stop)
         else:
             events = resumed(scanner, info, sweep, held, self._stop)
-        self._run_sweep(events, RunningSweep(self._sweeps, info, sweep.id, held))
+        self._run_sweep(events, RunningSweep(self._sweeps, info, sweep.id, held, repairs=self._repairs))
 
     def _run_sweep(self, events: SweepEvents, running: RunningSweep) -> None:
         """One sweep, from its header to the grid that it makes. Raises DriverError.

@@ -62,7 +62,8 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
         log.warning("library: after the last end: %s", found)
     for problem in library.problems:
         log.warning("library: %s left alone: %s", problem.name, problem.reason)
-    for said in await asyncio.to_thread(publish_complete, library.sweeps, partial(_keep, library)):
+    keep = partial(_keep, library)
+    for said in await asyncio.to_thread(publish_complete, library.sweeps, keep, config.capture.repair):
         log.warning("library: %s", said)
     exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers)
     stack.callback(exhibits.close)
@@ -119,7 +120,7 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
     link = config_for(address, config.capture.stale_s)
     c = config.capture
     request = SweepRequest(passes=c.passes, overlap=c.overlap, stride=c.stride)
-    return Capture(opened, link, deliver, live.watch, library.sweeps, request), announce
+    return Capture(opened, link, deliver, live.watch, library.sweeps, request, c.repair), announce
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:

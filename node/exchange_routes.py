@@ -87,7 +87,7 @@ def _check_free(places: asyncio.Semaphore) -> None:
 
 def _write(scan: Scan, suffix: str, file: BinaryIO) -> None:
     try:
-        writer_of(suffix)(Grid(scan.spec, scan.range_steps, scan.texture), file)
+        writer_of(suffix)(scan.grid, file)
         file.flush()
     except ExchangeError as problem:
         raise web.HTTPUnprocessableEntity(text=str(problem)) from problem

@@ -40,7 +40,7 @@ from node.scan_folder import (
 from node.sidecar import FILE as SIDECAR_FILE
 from node.sidecar import Changes, Sidecar, change_sidecar, read_sidecar
 from protocol.errors import LibraryError
-from protocol.grid import Grid, GridSpec, ImageArray, StepArray
+from protocol.grid import Grid, GridSpec, ImageArray, RepairArray, StepArray
 
 __all__ = ["About", "Library", "Problem", "Scan", "ScanSummary", "content_id", "survey", "verify"]
 
@@ -65,6 +65,7 @@ class Scan:
 
     range_steps : (H, W) uint16, 0 = void.  filled : the same with voids taken from the nearest measured sample.
     texture : (Ht, Wt, 3) uint8 RGB.        pyramid : the texture at spacings 1, 2, 4, ... up to the first view's.
+    repairs : (n, 3) int32, as Grid.repairs.
     """
 
     id: str
@@ -75,6 +76,12 @@ class Scan:
     coarse: Coarse
     filled: StepArray
     pyramid: tuple[ImageArray, ...]
+    repairs: RepairArray
+
+    @property
+    def grid(self) -> Grid:
+        """Its samples, without what is derived from them."""
+        return Grid(self.spec, self.range_steps, self.texture, self.repairs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +230,7 @@ class Library:
     def _write(self, grid: Grid, about: About) -> ScanSummary:
         scan_id = content_id(grid)
         sequence = 1 + max((summary.sequence for summary in self._known.values()), default=0)
-        record = Record(FORMAT, scan_id, sequence, grid.spec, about)
+        record = Record(FORMAT, scan_id, sequence, grid.spec, about, len(grid.repairs))
         try:
             if scan_id in self._known:
                 write_record(self.folder / scan_id, record)
@@ -327,5 +334,6 @@ def _scan(summary: ScanSummary, grid: Grid, derived: _Derived) -> Scan:
     """grid : mapped from disk."""
     pyramid = (grid.texture, *derived.smaller)
     return Scan(
-        summary.id, grid.spec, summary.about, grid.range_steps, grid.texture, derived.coarse, derived.filled, pyramid
-    )
+        summary.id, grid.spec, summary.about, grid.range_steps, grid.texture, derived.coarse, derived.filled, pyramid,
+        grid.repairs,
+    )  # fmt: skip

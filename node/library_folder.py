@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 
 from node.durable import NEW, disk_error, read_bounded, sync_folder, write_whole
-from node.scan_folder import INCOMING, RANGE_FILE, RECORD_FILE, SCAN_ID, TEXTURE_FILE
+from node.scan_folder import INCOMING, RANGE_FILE, RECORD_FILE, REPAIRS_FILE, SCAN_ID, TEXTURE_FILE
 from node.sidecar import FILE as SIDECAR_FILE
 from protocol.errors import LibraryError
 
@@ -28,7 +28,7 @@ OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, "node-id", "access", "audit"})  #
 TRASH, RESTORE = ".trash-", ".restore-"
 UNFINISHED = (INCOMING, TRASH, RESTORE)
 CHECKED = "checked"  # in a .restore- folder: everything in it was unpacked and found sound
-SCAN_FILES = frozenset({RANGE_FILE, TEXTURE_FILE, RECORD_FILE, SIDECAR_FILE})
+SCAN_FILES = frozenset({RANGE_FILE, TEXTURE_FILE, REPAIRS_FILE, RECORD_FILE, SIDECAR_FILE})
 _MARK_BYTES_MAX = 4096
 
 

@@ -1,4 +1,4 @@
-"""Single bad range samples: spikes taken out, small holes filled and marked; larger holes stay void.
+"""Single bad range samples: spikes taken out, small holes filled; larger holes stay void. What was measured is kept.
 
 A spike lies further from all eight neighbours than any surface this grid resolves could. A hole of up to three cells
 is filled with the mean of the measured cells round it, weighted by nearness. Columns are cyclic, rows are not.
@@ -26,26 +26,39 @@ _WEIGHT = np.array([1 / (r * r + c * c) for r, c in _NEAR])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Repaired:
-    """A grid without spikes and small holes. filled : (H, W) cells whose value is made up.  spikes : how many."""
+    """A grid without spikes and small holes, which tells its repairs. spikes, filled : how many."""
 
     grid: Grid
-    filled: BoolArray
     spikes: int
+    filled: int
 
 
 def repair(grid: Grid, noise_mm: float = 0.0) -> Repaired:
-    """Take spikes out and fill small holes; a grid without any is returned as it is, bit for bit."""
+    """Take spikes out and fill small holes of a grid as it was measured; one without any is returned as it is.
+
+    The same measurement gives the same grid, bit for bit; `undone` is the inverse.
+    """
     tall_mm = max(SPIKE_ROWS * grid.spec.pitch_mm, SPIKE_SIGMAS * noise_mm)
-    spikes = spikes_in(grid.range_steps, tall_mm / grid.spec.step_mm)
-    steps = np.where(spikes, np.uint16(VOID), grid.range_steps) if spikes.any() else grid.range_steps
-    holes = small_holes(steps == VOID)
-    filled, values = fill(steps, np.argwhere(holes))
-    if filled.size:
-        steps = steps.copy()
-        steps[tuple(filled.T)] = values
-    mask = np.zeros(steps.shape, np.bool_)
-    mask[tuple(filled.T)] = True
-    return Repaired(Grid(grid.spec, steps, grid.texture), mask, int(spikes.sum()))
+    changed = spikes_in(grid.range_steps, tall_mm / grid.spec.step_mm)
+    spikes = int(changed.sum())
+    steps = np.where(changed, np.uint16(VOID), grid.range_steps) if spikes else grid.range_steps
+    filled, values = fill(steps, np.argwhere(small_holes(steps == VOID)))
+    changed[tuple(filled.T)] = True
+    cells = np.argwhere(changed)
+    if not cells.size:
+        return Repaired(grid, 0, 0)
+    repairs = np.column_stack([cells, grid.range_steps[tuple(cells.T)]]).astype(np.int32)
+    steps = steps.copy()
+    steps[tuple(filled.T)] = values
+    return Repaired(Grid(grid.spec, steps, grid.texture, repairs), spikes, len(filled))
+
+
+def undone(grid: Grid) -> Grid:
+    """A grid as it was measured: inverse of repair."""
+    steps = grid.range_steps.copy()
+    rows, columns, measured = grid.repairs.T
+    steps[rows, columns] = measured
+    return Grid(grid.spec, steps, grid.texture)
 
 
 def spikes_in(steps: StepArray, tall_steps: float) -> BoolArray:

@@ -26,7 +26,6 @@ from protocol.scanner_messages import (
 )
 
 RESUME_WITHIN_S = 30.0  # a cut sweep goes on by itself this soon; later, whoever stood on the table may have left it
-REPAIRS = False  # a scan keeps no mask of what was filled, so nothing is: every sample of it was measured
 STOPPED = "stopped"  # how drivers.sweep calls the end that we asked for
 
 
@@ -68,24 +67,31 @@ def cut_lately(sweeps: Sequence[Interrupted], info: DeviceInfo, now_unix_s: floa
     return None
 
 
-def publish_complete(sweeps: Journals, deliver: Callable[[Assembly], object]) -> list[str]:
-    """Make scans of the complete sweeps that a crash kept from becoming ones. Returns what was done, or went wrong."""
+def publish_complete(sweeps: Journals, deliver: Callable[[Assembly], object], repairs: bool = True) -> list[str]:
+    """Make scans of the complete sweeps that a crash kept from becoming ones. Returns what was done, or went wrong.
+
+    deliver, repairs : as for publish.
+    """
     said = []
     for sweep in filter(lambda sweep: sweep.is_complete, sweeps.interrupted()):
         try:
-            publish(sweeps, sweep, deliver)
+            publish(sweeps, sweep, deliver, repairs)
             said.append(f"published sweep {sweep.id}, which was complete")
         except (FoveascanError, ValueError) as error:
             said.append(f"could not publish sweep {sweep.id}: {error}")
     return said
 
 
-def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Assembly], object]) -> None:
-    """Make a scan of one complete sweep. deliver : returns once it is durable. Raises FoveascanError, ValueError."""
+def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Assembly], object], repairs: bool = True) -> None:
+    """Make a scan of one complete sweep.
+
+    deliver : returns once it is durable.  repairs : whether spikes are taken out and small holes filled.
+    Raises FoveascanError, ValueError.
+    """
     assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
     for column in sweeps.columns(sweep.id):
         add_column(assembler, column)
-    deliver(assembler.assembly(repairs=REPAIRS))
+    deliver(assembler.assembly(repairs=repairs))
     sweeps.delete(sweep.id)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from drivers.scanner import SweepReport
 from node.assemble import Assembler, Assembly
 from node.journal import Journal, Journals
-from node.resume import REPAIRS, add_column, encoder_of
+from node.resume import add_column, encoder_of
 from protocol.errors import RemoteWireError, ScannerFault
 from protocol.scanner_messages import Column, DeviceInfo, Outcome, SweepEnd, SweepHeader
 
@@ -19,12 +19,20 @@ class RunningSweep:
 
     sweeps : where journals are; None: nothing is kept.  info : the scanner.
     sweep_id, held : the interrupted sweep that goes on, and its columns; None and nothing for a new one.
+    repairs : whether spikes are taken out and small holes filled.
     """
 
     def __init__(
-        self, sweeps: Journals | None, info: DeviceInfo, sweep_id: str | None = None, held: Sequence[Column] = ()
+        self,
+        sweeps: Journals | None,
+        info: DeviceInfo,
+        sweep_id: str | None = None,
+        held: Sequence[Column] = (),
+        *,
+        repairs: bool = True,
     ) -> None:
         self.held = held
+        self._repairs = repairs
         self._sweeps = sweeps
         self._info = info
         self._sweep_id = sweep_id
@@ -61,7 +69,7 @@ class RunningSweep:
         """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
         assert self._assembler is not None
         self.flush()
-        assembly = self._assembler.assembly(repairs=REPAIRS)
+        assembly = self._assembler.assembly(repairs=self._repairs)
         quality = replace(
             assembly.quality, requested_columns=report.requested_columns, dropped_bytes=report.dropped_bytes
         )

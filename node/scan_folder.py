@@ -2,10 +2,11 @@
 
     <library>/<scan id>/range.npy      (H, W) uint16 steps, little-endian, 0 = void
                         texture.npy    (Ht, Wt, 3) uint8 RGB
+                        repairs.npy    (n, 3) int32, as Grid.repairs; missing where there are none
                         scan.json      format, id, sequence, geometry, where it came from
                         sidecar.json   what people say of it (node.sidecar); missing until somebody does
 
-The id is the hash of geometry and samples, so it also tells whether a file has rotted.
+The id is the hash of geometry, samples and repairs, so it also tells whether a file has rotted.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -26,7 +28,7 @@ import numpy as np
 from node.durable import read_bounded, sync_folder, write_whole
 from node.scan_quality import ScanQuality
 from protocol.errors import LibraryError
-from protocol.grid import Grid, GridSpec, ImageArray, StepArray
+from protocol.grid import Grid, GridSpec, ImageArray, RepairArray, StepArray, no_repairs
 
 FORMAT = 1
 RECORD_BYTES_MAX = 65536
@@ -35,7 +37,8 @@ TEXT_MAX = 200
 NAMED_MAX = 3
 SCAN_ID = re.compile("[0-9a-f]{32}")
 INCOMING = ".incoming-"
-RANGE_FILE, TEXTURE_FILE, RECORD_FILE = "range.npy", "texture.npy", "scan.json"
+RANGE_FILE, TEXTURE_FILE, REPAIRS_FILE, RECORD_FILE = "range.npy", "texture.npy", "repairs.npy", "scan.json"
+REPAIR_BYTES = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +77,14 @@ def name_problems(problems: Sequence[Problem]) -> str:
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """scan.json. sequence : grows with every scan of a library, and orders them."""
+    """scan.json. sequence : grows with every scan of a library, and orders them.  repairs : rows of repairs.npy."""
 
     format: int
     id: str
     sequence: int
     spec: GridSpec
     about: About
+    repairs: Annotated[int, msgspec.Meta(ge=0)] = 0
 
 
 class _Version(msgspec.Struct, frozen=True):
@@ -90,11 +94,12 @@ class _Version(msgspec.Struct, frozen=True):
 
 
 def content_id(grid: Grid) -> str:
-    """Name of a grid: 32 hexadecimal digits, the first half of SHA-256 over its geometry and samples."""
+    """Name of a grid: 32 hexadecimal digits, the first half of SHA-256 over its geometry, samples and repairs."""
     digest = hashlib.sha256(b"foveascan scan 1\n")
     digest.update(_spec_json(grid.spec))
     digest.update(np.ascontiguousarray(grid.range_steps, "<u2").data)
     digest.update(np.ascontiguousarray(grid.texture).data)
+    digest.update(np.ascontiguousarray(grid.repairs, "<i4").data)
     return digest.hexdigest()[:32]
 
 
@@ -116,7 +121,7 @@ def read_record(folder: Path) -> Record:
         raise LibraryError(f"its {RECORD_FILE} cannot be read: {error.strerror}") from error
     if record.id != folder.name:
         raise LibraryError(f"its {RECORD_FILE} belongs to scan {record.id[:40]!r}")
-    _check_sizes(folder, record.spec)
+    _check_sizes(folder, record)
     return record
 
 
@@ -135,9 +140,17 @@ def read_grid(folder: Path, spec: GridSpec) -> Grid:
     try:
         range_steps = np.load(folder / RANGE_FILE, mmap_mode="r", allow_pickle=False)
         texture = np.load(folder / TEXTURE_FILE, mmap_mode="r", allow_pickle=False)
-        return Grid(spec, range_steps, texture)
+        return Grid(spec, range_steps, texture, _read_repairs(folder / REPAIRS_FILE))
     except (OSError, ValueError, EOFError) as error:
         raise LibraryError(f"its samples cannot be read: {error}") from error
+
+
+def _read_repairs(path: Path) -> RepairArray:
+    """Raises OSError, ValueError, EOFError."""
+    if not path.exists():
+        return no_repairs()
+    repairs: RepairArray = np.load(path, mmap_mode="r", allow_pickle=False)
+    return repairs
 
 
 def read_sound_grid(folder: Path, spec: GridSpec) -> Grid:
@@ -157,6 +170,8 @@ def write_scan(library: Path, record: Record, grid: Grid) -> None:
     try:
         _write_array(incoming / RANGE_FILE, np.ascontiguousarray(grid.range_steps, "<u2"))
         _write_array(incoming / TEXTURE_FILE, np.ascontiguousarray(grid.texture))
+        if grid.repairs.size:
+            _write_array(incoming / REPAIRS_FILE, np.ascontiguousarray(grid.repairs, "<i4"))
         write_record(incoming, record)
         os.rename(incoming, library / record.id)
         sync_folder(library)
@@ -170,11 +185,13 @@ def write_record(folder: Path, record: Record) -> None:
     write_whole(folder / RECORD_FILE, msgspec.json.format(msgspec.json.encode(record)))
 
 
-def _check_sizes(folder: Path, spec: GridSpec) -> None:
+def _check_sizes(folder: Path, record: Record) -> None:
     """A listing must not read samples: the sizes of their files show what was cut or lost."""
-    range_bytes = 2 * spec.height * spec.width
-    texture_bytes = 3 * spec.texture_height * spec.texture_width
-    for name, size_bytes in ((RANGE_FILE, range_bytes), (TEXTURE_FILE, texture_bytes)):
+    spec = record.spec
+    sizes = {RANGE_FILE: 2 * spec.height * spec.width, TEXTURE_FILE: 3 * spec.texture_height * spec.texture_width}
+    if record.repairs:
+        sizes[REPAIRS_FILE] = REPAIR_BYTES * record.repairs
+    for name, size_bytes in sizes.items():
         try:
             header_bytes = os.stat(folder / name).st_size - size_bytes
         except OSError as error:
@@ -183,7 +200,7 @@ def _check_sizes(folder: Path, spec: GridSpec) -> None:
             raise LibraryError(f"its {name} has the wrong size")
 
 
-def _write_array(path: Path, array: StepArray | ImageArray) -> None:
+def _write_array(path: Path, array: StepArray | ImageArray | RepairArray) -> None:
     with open(path, "xb") as file:
         np.save(file, array, allow_pickle=False)
         file.flush()

@@ -10,7 +10,7 @@ places: range is the distance from a centre on the axis, and rows are polar angl
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -29,6 +29,7 @@ IntArray = NDArray[np.int64]
 StepArray = NDArray[np.uint16]
 ImageArray = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
+RepairArray = NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +80,24 @@ class GridSpec:
         return int(v * self.height), int(u * self.width)
 
 
+def no_repairs() -> RepairArray:
+    """The repairs of a grid that is as it was measured. (0, 3)"""
+    return np.empty((0, 3), np.int32)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """A scan's samples: range_steps (H, W) uint16, 0 = void; texture (Ht, Wt, 3) uint8 RGB."""
+    """A scan's samples: range_steps (H, W) uint16, 0 = void; texture (Ht, Wt, 3) uint8 RGB.
+
+    repairs : (n, 3) int32, the range cells that are not as they were measured, row by row: row, column, and the steps
+    that were measured there, 0 for nothing. Raises ValueError where shapes or types do not fit, or repairs leave the
+    grid or their order.
+    """
 
     spec: GridSpec
     range_steps: StepArray
     texture: ImageArray
+    repairs: RepairArray = field(default_factory=no_repairs)
 
     def __post_init__(self) -> None:
         s = self.spec
@@ -93,6 +105,15 @@ class Grid:
             raise ValueError(f"range_steps must be ({s.height}, {s.width}) uint16")
         if self.texture.shape != (s.texture_height, s.texture_width, 3) or self.texture.dtype != np.uint8:
             raise ValueError(f"texture must be ({s.texture_height}, {s.texture_width}, 3) uint8")
+        _check_repairs(self.repairs, s.height, s.width)
+
+    @property
+    def filled(self) -> BoolArray:
+        """(H, W) cells whose range was not measured but made up from what is round them."""
+        rows, columns = self.repairs[:, 0], self.repairs[:, 1]
+        filled = np.zeros(self.range_steps.shape, np.bool_)
+        filled[rows, columns] = self.range_steps[rows, columns] != VOID
+        return filled
 
     @property
     def range_mm(self) -> NDArray[np.float32]:
@@ -128,6 +149,17 @@ def dequantise(values: StepArray, quantum: int) -> StepArray:
     """Inverse of quantise, to within quantum // 2 steps: clamp(k quantum, 1, 65535); never void."""
     range_steps: StepArray = np.clip(values.astype(np.uint32) * np.uint32(quantum), 1, STEPS_MAX).astype(np.uint16)
     return range_steps
+
+
+def _check_repairs(repairs: RepairArray, height: int, width: int) -> None:
+    if repairs.ndim != 2 or repairs.shape[1] != 3 or repairs.dtype != np.int32:
+        raise ValueError(f"repairs must be (n, 3) int32, got {repairs.shape} {repairs.dtype}")
+    if not repairs.size:
+        return
+    if repairs.min() < 0 or (repairs.max(axis=0) >= (height, width, STEPS_MAX + 1)).any():
+        raise ValueError(f"repairs lie outside {height} rows, {width} columns and {STEPS_MAX} steps")
+    if (np.diff(repairs[:, 0] * np.int64(width) + repairs[:, 1]) <= 0).any():
+        raise ValueError("repairs must go row by row, each cell once")
 
 
 def _check_between(name: str, value: float, low: float, high: float) -> None:

@@ -5,6 +5,7 @@ All landmarks are (s, z) in mm on the unrolled sheet; the left and the right sid
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,7 +128,14 @@ def unseen_cells(range_mm: Plane, sheet: Sheet, seed: int) -> NDArray[np.bool_]:
         for side in _sides(centre):
             add_bump(doubt, sheet, side, sigma, amount)
     ragged = 0.17 * fractal_noise(rng, (24, 48), sheet.shape, 5, 0.75)
-    return np.asarray((doubt + ragged > UNSEEN) | np.isnan(range_mm))
+    return _without_specks(np.asarray((doubt + ragged > UNSEEN) | np.isnan(range_mm)))
+
+
+def _without_specks(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Only what 2 x 2 cells fit into: a node would take less for a flaw of the camera, and repair it. (m, n) bool"""
+    padded = cv2.copyMakeBorder(unseen.astype(np.uint8), 0, 0, 1, 1, cv2.BORDER_WRAP)
+    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return np.asarray(opened[:, 1:-1], np.bool_)
 
 
 def _sides(centre: Point) -> tuple[Point, ...]:

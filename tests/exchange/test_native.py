@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,18 @@ def test_a_grid_comes_back_bit_for_bit(grid: Grid) -> None:
     name, back = read_native(file)
     assert name == "vase" and back.spec == grid.spec
     assert np.array_equal(back.range_steps, grid.range_steps) and np.array_equal(back.texture, grid.texture)
+
+
+def test_repairs_come_back_and_only_where_the_grid_has_such_cells() -> None:
+    repairs = np.array([[0, 3, 0], [2, 1, 700]], np.int32)
+    file = io.BytesIO()
+    write_native(replace(vase(), repairs=repairs), file)
+    back = read_native(file)[1]
+    assert np.array_equal(back.repairs, repairs)
+    assert np.argwhere(back.filled).tolist() == [[r, c] for r, c, _ in repairs.tolist() if back.range_steps[r, c]]
+    for wrong in ([[0, 0, 0], [0, 0, 0]], [[0, 3, 0], [0, 2, 0]], [[3, 0, 0]], [[0, 4, 0]], [[0, 0, 65536]], [[0, 0]]):
+        with pytest.raises(ExchangeError, match="repairs"):
+            read_native(packed(texture=TEXTURE, repairs=np.array(wrong, np.int32)))
 
 
 def test_a_grid_as_make_cyl_writes_it_with_its_image_beside(tmp_path: Path) -> None:

@@ -27,7 +27,9 @@ Members = list[tuple[str, bytes]]
 def grid(seed: int) -> Grid:
     rng = np.random.default_rng(seed)
     range_steps = rng.integers(0, 3, (SPEC.height, SPEC.width)).astype(np.uint16)
-    return Grid(SPEC, range_steps, rng.integers(0, 256, (SPEC.texture_height, SPEC.texture_width, 3)).astype(np.uint8))
+    texture = rng.integers(0, 256, (SPEC.texture_height, SPEC.texture_width, 3)).astype(np.uint8)
+    repairs = np.array([[3, 4, 0], [3, 5, 7]][: seed % 3], np.int32).reshape(-1, 3)
+    return Grid(SPEC, range_steps, texture, repairs)
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,8 @@ def test_the_id_tells_any_change_of_samples_or_geometry() -> None:
         Grid(other_spec, grid.range_steps, grid.texture),
     ]
     grids.append(Grid(replace(SPEC, geometry="sphere"), grid.range_steps, grid.texture))
-    assert len({content_id(g) for g in grids}) == 5
+    grids += [replace(grid, repairs=np.array([row], np.int32)) for row in ((3, 4, 0), (3, 4, 9), (3, 5, 0))]
+    assert len({content_id(g) for g in grids}) == 8
     assert content_id(Grid(SPEC, np.asfortranarray(grid.range_steps), grid.texture)) == content_id(grid)
 
 
@@ -103,6 +104,23 @@ def test_a_cylinders_id_is_what_it_was_before_there_were_spheres() -> None:
     spec = GridSpec(8, 2, 16, 2, step_mm=0.05, pitch_mm=1.0)
     grid = Grid(spec, np.arange(16, dtype=np.uint16).reshape(2, 8), np.zeros((2, 16, 3), np.uint8))
     assert content_id(grid) == "a720f80d2fff05eaaabc107be9b2e809"
+
+
+def test_what_was_repaired_is_kept_with_the_scan_and_checked(tmp_path: Path) -> None:
+    repairs = np.array([[0, 3, 0], [2, 1, 700]], np.int32)
+    library = Library(tmp_path)
+    scan = library.add(replace(_grid(0), repairs=repairs), ABOUT)
+    library = _reopened(library)
+    for found in (scan, library.open(scan.id)):
+        assert np.array_equal(found.grid.repairs, repairs) and content_id(found.grid) == scan.id
+    path = tmp_path / scan.id / "repairs.npy"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-4] + b"\1\0\0\0")
+    with pytest.raises(LibraryError, match="not what they were"):
+        _reopened(library).open(scan.id)
+    for damage in (lambda: path.write_bytes(whole[:-12]), path.unlink):
+        damage()
+        assert [problem.name for problem in survey(tmp_path)[1]] == [scan.id]
 
 
 def test_a_sphere_is_kept_as_one(tmp_path: Path) -> None:

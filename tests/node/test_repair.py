@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from node.repair import fill, repair, small_holes, spikes_in
+from node.repair import fill, repair, small_holes, spikes_in, undone
 from protocol.grid import Grid, GridSpec, StepArray
 
 SPEC = GridSpec(width=64, height=32, texture_width=64, texture_height=32, step_mm=0.01, pitch_mm=1.0)
@@ -20,9 +20,10 @@ def _grid(steps: StepArray) -> Grid:
 def test_a_sound_grid_stays_as_it_is() -> None:
     steps = _bumpy()
     steps[:4] = steps[10:20, 60:] = 0  # large voids are not holes to be filled
-    repaired = repair(_grid(steps))
-    np.testing.assert_array_equal(repaired.grid.range_steps, steps)
-    assert repaired.spikes == 0 and not repaired.filled.any()
+    grid = _grid(steps)
+    repaired = repair(grid)
+    assert repaired.grid is grid and (repaired.spikes, repaired.filled) == (0, 0)
+    assert not grid.repairs.size and not grid.filled.any()
 
 
 @pytest.mark.parametrize("row, column", [(0, 0), (31, 63), (15, 63), (15, 0), (12, 30)])
@@ -31,8 +32,9 @@ def test_a_spike_is_taken_out_and_its_place_filled_and_marked(row: int, column: 
     sound, steps = _bumpy(), _bumpy()
     steps[row, column] = int(steps[row, column]) + height
     repaired = repair(_grid(steps))
-    assert repaired.spikes == 1
-    assert np.argwhere(repaired.filled).tolist() == [[row, column]]
+    assert (repaired.spikes, repaired.filled) == (1, 1)
+    assert np.argwhere(repaired.grid.filled).tolist() == [[row, column]]
+    assert repaired.grid.repairs.tolist() == [[row, column, steps[row, column]]]
     error = repaired.grid.range_steps.astype(int) - sound
     assert np.abs(error).max() < 60 and np.count_nonzero(error) <= 1
 
@@ -56,8 +58,30 @@ def test_holes_of_up_to_three_cells_are_filled(cells: list[tuple[int, int]]) -> 
     for cell in cells:
         steps[cell] = 0
     repaired = repair(_grid(steps))
-    assert {tuple(cell) for cell in np.argwhere(repaired.filled).tolist()} == set(cells)
+    assert {tuple(cell) for cell in np.argwhere(repaired.grid.filled).tolist()} == set(cells)
     assert np.abs(repaired.grid.range_steps.astype(int) - _bumpy()).max() < 80
+
+
+def test_a_spike_at_the_edge_of_a_large_void_becomes_void_and_is_told() -> None:
+    steps = _bumpy()
+    steps[10:20, 30:40] = 0
+    steps[10, 29] += 3000
+    repaired = repair(_grid(steps))
+    assert repaired.grid.repairs.tolist() == [[10, 29, int(steps[10, 29])]]
+    assert repaired.grid.range_steps[10, 29] == 0 and not repaired.grid.filled.any()
+
+
+def test_what_was_measured_can_be_had_again() -> None:
+    rng = np.random.default_rng(7)
+    steps = _bumpy()
+    steps[rng.random(steps.shape) < 0.02] = 0
+    steps[rng.random(steps.shape) < 0.01] += 3000
+    repaired = repair(_grid(steps))
+    assert repaired.spikes > 3 and repaired.filled > 20
+    np.testing.assert_array_equal(undone(repaired.grid).range_steps, steps)
+    again = repair(undone(repaired.grid)).grid
+    np.testing.assert_array_equal(again.range_steps, repaired.grid.range_steps)
+    np.testing.assert_array_equal(again.repairs, repaired.grid.repairs)
 
 
 def test_a_hole_of_four_cells_stays_void() -> None:

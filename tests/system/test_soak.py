@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from protocol.scanner_messages import Order, SweepRequest
 from tests.system.fault_rig import Bench, Capturing, Ending, bumpy, memory
 
 S = GridSpec(360, 100, 1024, 256, 0.01, 2.0)
-SWEEPS = 200 if "CI" in os.environ else 20
+SWEEPS = 200
 PORTION = 10
 SHARES = ("loss", "flip", "burst", "truncate", "lie", "twice", "reorder")
 ONCE = ("stall=0.1", "stall=1", "stall=5", "reset", "unplug=0.2", "minor", "overshoot=0.1", "reversed")
