@@ -47,12 +47,12 @@ def run_pair(args: argparse.Namespace) -> int:
     import time
 
     from node.access import access_folder
-    from node.tls import certificate_files, certificate_fingerprint
+    from node.tls import certificate_file, certificate_fingerprint
     from protocol.errors import AccessError
     from protocol.pairing import fingerprint_text
 
     config = _config(args)
-    certificate, _ = certificate_files(config.server, access_folder(_library(config)))
+    certificate = certificate_file(config.server, access_folder(_library(config)))
     if not certificate.exists():
         raise AccessError("there is no certificate yet: start the node once, without --insecure")
     shown = certificate_fingerprint(certificate)

@@ -127,6 +127,10 @@ class Capture:
         """When the thread last showed that it gets on. [s, time.monotonic]"""
         return self._beat_s
 
+    def sweep_like(self, request: SweepRequest) -> None:
+        """How to sweep from the next sweep on."""
+        self._sweep_request = request
+
     def start(self) -> None:
         """Begin to connect."""
         self._thread.start()

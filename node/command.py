@@ -23,6 +23,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     serve.add_argument("--scanner", metavar="ADDRESS", help=f"{ADDRESS}; none: library only")
     serve.add_argument("--baud", type=_baud, help="its speed in baud, 9600..12000000 (3000000)")
     serve.add_argument("--name", help="name to announce on the network (this host's)")
+    serve.add_argument("--check", action="store_true", help="only say whether the settings are sound")
     serve.add_argument("--json", action="store_true", help="print one JSON object once the node is ready")
     serve.set_defaults(run=run_serve)
 
@@ -47,17 +48,20 @@ def _baud(text: str) -> int:
 
 
 def run_serve(args: argparse.Namespace) -> int:
-    """Run the node until SIGTERM or SIGINT."""
+    """Run the node until SIGTERM or SIGINT; on SIGHUP it reads its settings anew."""
     import asyncio
+    import faulthandler
     import json
+    from functools import partial
 
     import uvloop
 
     from node.config import load_config
     from node.daemon import run_node
-    from node.log import start_log
+    from node.log import set_level, start_log
 
     start_log()
+    faulthandler.enable()  # a watchdog ends us with SIGABRT: then the journal says where every thread was
     overrides = {
         "library.folder": args.library,
         "server.listen": args.listen,
@@ -66,13 +70,18 @@ def run_serve(args: argparse.Namespace) -> int:
         "capture.baud": args.baud,
         "discovery.name": args.name,
     }
-    config = load_config(args.config, overrides)
+    reread = partial(load_config, args.config, overrides)
+    config = reread()
+    set_level(config.log.level)
+    if args.check:
+        print(json.dumps({"sound": True}) if args.json else "the settings are sound")
+        return 0
 
     def ready(url: str) -> None:
         print(json.dumps({"ready": True, "url": url}) if args.json else f"Serving {url}", flush=True)
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-        runner.run(run_node(config, ready))
+        runner.run(run_node(config, ready, reread))
     return 0
 
 

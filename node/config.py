@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Mapping
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -63,7 +63,7 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
     listen: Annotated[str, Meta(max_length=300)] = "127.0.0.1:7345"  # HOST:PORT or [IPv6]:PORT; port 0: any free one
     insecure: bool = False  # plain HTTP without login, on loopback only
     certificate: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM; none: the node makes its own
-    key: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM, of the certificate
+    key: Annotated[str, Meta(min_length=1, max_length=4096)] | None = None  # PEM, its key; or "credential:NAME"
     max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
     trusted_proxies: Annotated[tuple[str, ...], Meta(max_length=16)] = ()  # your addresses, believed for whom they ask
     shared_cache: bool = False  # let a cache of yours keep foveae, for a day at most
@@ -140,6 +140,12 @@ class Discovery(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"name: expected at most {DNS_LABEL_MAX_BYTES} bytes of UTF-8, got {size_bytes}")
 
 
+class Log(Struct, frozen=True, forbid_unknown_fields=True):
+    """[log]: what goes to standard error."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"  # and what is worse
+
+
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """All sections; each part of the node is handed its own."""
 
@@ -150,6 +156,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     first_view: FirstView = FirstView()
     planner: Planner = Planner()
     discovery: Discovery = Discovery()
+    log: Log = Log()
 
 
 def load_config(path: Path | None = None, overrides: Mapping[str, object] | None = None) -> Config:

@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -24,37 +25,80 @@ from node.exhibits import Exhibits
 from node.identity import node_identity
 from node.library import About, Library, Scan
 from node.live import Live
-from node.notify import Notifier, keep_notified, status_text
+from node.log import set_level
+from node.notify import Beating, Notifier, keep_notified, status_text
+from node.reload import compare
 from node.resume import publish_complete
 from node.serve import NodeServer
 from node.tls import Tls
 from protocol import messages as m
+from protocol.errors import AccessError, ConfigError
 from protocol.pairing import fingerprint_text
 from protocol.scanner_messages import SweepRequest
 
 log = logging.getLogger(__name__)
 
 
-async def run_node(config: Config, ready: Callable[[str], None]) -> None:
-    """Serve until SIGTERM or SIGINT. ready : called once with the node's URL when everything is up."""
-    stop = asyncio.Event()
+@dataclass(slots=True)
+class Node:
+    """What runs. url : that clients use; capture : the scanner's owner, if there is a scanner."""
+
+    config: Config
+    url: str
+    server: NodeServer
+    exhibits: Exhibits
+    capture: Capture | None
+
+    def use(self, wanted: Config) -> str:
+        """Take what can be taken of other settings; what that was, and what was not. Raises AccessError."""
+        change = compare(self.config, wanted)
+        self.server.use(change.config)
+        self.config = change.config
+        set_level(change.config.log.level)
+        if self.capture is not None:
+            self.capture.sweep_like(sweep_request(change.config))
+        return str(change)
+
+    def parts(self) -> dict[str, Beating]:
+        """Whose progress shows that the node lives, beside the event loop's."""
+        threads: dict[str, Beating] = {"the encoding threads": self.exhibits}
+        return threads | ({"the capture thread": self.capture} if self.capture else {})
+
+
+async def run_node(config: Config, ready: Callable[[str], None], reread: Callable[[], Config]) -> None:
+    """Serve until SIGTERM or SIGINT; on SIGHUP, read the settings anew.
+
+    ready : called once with the node's URL when everything is up.  reread : the settings as they are now; may raise
+    ConfigError, and then all stays as it was.
+    """
+    signals: asyncio.Queue[signal.Signals] = asyncio.Queue()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        loop.add_signal_handler(number, signals.put_nowait, number)
     notifier = Notifier.from_environment(os.environ)
     async with AsyncExitStack() as stack:
-        url, capture = await start_node(config, stack)
-        ready(url)
-        notifier.ready(status_text(url, capture))
-        telling = asyncio.create_task(keep_notified(notifier, url, capture))
-        await stop.wait()
+        node = await start_node(config, stack)
+        ready(node.url)
+        notifier.ready(status_text(node.url, node.capture))
+        telling = asyncio.create_task(keep_notified(notifier, node.url, node.capture, node.parts()))
+        while await signals.get() is signal.SIGHUP:
+            notifier.reloading()
+            _reload(node, reread)
+            notifier.ready(status_text(node.url, node.capture))
         telling.cancel()
         notifier.stopping()
         log.info("stopping")
 
 
-async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Capture | None]:
-    """Bring up every part and leave its end to the stack. Returns the URL that clients use, and the scanner's owner."""
+def _reload(node: Node, reread: Callable[[], Config]) -> None:
+    try:
+        log.warning("read the settings anew: %s", node.use(reread()))
+    except (ConfigError, AccessError) as error:
+        log.error("the settings stay as they were: %s", error)
+
+
+async def start_node(config: Config, stack: AsyncExitStack) -> Node:
+    """Bring up every part and leave its end to the stack."""
     folder = config.library.path
     library = await asyncio.to_thread(Library, folder, config.first_view.max_bytes)
     stack.callback(library.close)
@@ -82,7 +126,7 @@ async def start_node(config: Config, stack: AsyncExitStack) -> tuple[str, Captur
     if config.discovery.enabled:
         await stack.enter_async_context(Advertisement(info.name, info.id, host, port, tls.fingerprint if tls else ""))
     scheme, address = "https" if tls else "http", f"[{host}]" if ":" in host else host
-    return f"{scheme}://{address}:{port}", capture
+    return Node(config, f"{scheme}://{address}:{port}", server, exhibits, capture)
 
 
 def _entrance(config: Config, library: Path, node_id: str) -> tuple[Access | None, Tls | None]:
@@ -118,9 +162,13 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
 
     opened = partial(open_port, address, config.capture.baud)
     link = config_for(address, config.capture.stale_s)
+    return Capture(opened, link, deliver, live.watch, library.sweeps, sweep_request(config), config.capture.repair), announce
+
+
+def sweep_request(config: Config) -> SweepRequest:
+    """How to sweep."""
     c = config.capture
-    request = SweepRequest(passes=c.passes, overlap=c.overlap, stride=c.stride)
-    return Capture(opened, link, deliver, live.watch, library.sweeps, request, c.repair), announce
+    return SweepRequest(passes=c.passes, overlap=c.overlap, stride=c.stride)
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:

@@ -46,7 +46,7 @@ from node.machine import (
     written_last_s,
 )
 from node.scan_folder import name_problems
-from node.tls import certificate_files, read_certificate
+from node.tls import certificate_file, read_certificate
 from protocol.errors import AccessError, ConfigError, LibraryError, PortLost
 from protocol.printable import counted
 
@@ -202,7 +202,7 @@ def check_certificate(server: settings.Server, library: Path, now: dt.datetime) 
     """Whether clients will find a certificate that is valid."""
     if server.insecure:
         return Finding("certificate", "warning", "none: no encryption, no logins", "remove server.insecure")
-    path, _ = certificate_files(server, library / FOLDER)
+    path = certificate_file(server, library / FOLDER)
     if server.certificate is None and not path.exists():
         return Finding("certificate", "ok", "none yet: the node makes one when it starts")
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -30,6 +31,8 @@ class Exhibits:
         self.library = library
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="encode")
+        self._working = 0
+        self._moved_s = 0.0
         self._views: OrderedDict[Key, asyncio.Future[Opening]] = OrderedDict()
         self._closing = threading.Event()
         self._surveyor = ThreadPoolExecutor(1, thread_name_prefix="survey")
@@ -78,7 +81,19 @@ class Exhibits:
 
     async def work(self, job: Callable[[], T]) -> T:
         """Run a job in one of the encoding threads."""
-        return await asyncio.get_running_loop().run_in_executor(self._pool, job)
+        if not self._working:
+            self._moved_s = time.monotonic()
+        self._working += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._pool, job)
+        finally:
+            self._working -= 1
+            self._moved_s = time.monotonic()
+
+    @property
+    def beat_s(self) -> float:
+        """When the encoding threads last showed that they get on; now, if nothing waits. [s, time.monotonic]"""
+        return self._moved_s if self._working else time.monotonic()
 
     def close(self) -> None:
         """Let running jobs end, start no more."""

@@ -32,6 +32,11 @@ def without_traceback(record: logging.LogRecord) -> bool:
     return True
 
 
+def set_level(level: str) -> None:
+    """From how bad on a record is told: "debug", "info", "warning" or "error"."""
+    logging.getLogger().setLevel(level.upper())
+
+
 def start_log() -> None:
     """Begin to log."""
     handler = logging.StreamHandler()

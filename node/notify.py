@@ -1,7 +1,8 @@
 """Telling systemd how we are, by its notification socket: ready, alive, stopping. Silent where nobody asked.
 
-The watchdog is fed by progress, not by a timer: the event loop has to come round to `keep_notified`, and the capture
-thread has to have shown since that it gets on. A node that hangs is started anew.
+The watchdog is fed by progress, not by a timer: the event loop has to come round to `keep_notified`, the capture thread
+has to have shown since that it gets on, and so have the encoding threads, if there is work for them. A node that hangs
+is started anew.
 
 Source: sd_notify(3), sd_watchdog_enabled(3).
 """
@@ -13,7 +14,8 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
+from typing import Protocol
 
 from node.capture import Capture
 
@@ -21,6 +23,14 @@ log = logging.getLogger(__name__)
 
 TICK_S = 1.0
 STATUS_MAX = 200
+
+
+class Beating(Protocol):
+    """Part of a node that works in threads of its own."""
+
+    @property
+    def beat_s(self) -> float:
+        """When it last showed that it gets on. [s, time.monotonic]"""
 
 
 class Notifier:
@@ -57,6 +67,10 @@ class Notifier:
         """Feed the watchdog."""
         self._send("WATCHDOG=1")
 
+    def reloading(self) -> None:
+        """Settings are read anew; `ready` ends that."""
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
     def stopping(self) -> None:
         """The end has begun."""
         self._send("STOPPING=1", "STATUS=Stopping")
@@ -72,13 +86,18 @@ class Notifier:
             log.warning("cannot tell systemd %s: %s", lines[0], error)
 
 
-async def keep_notified(notifier: Notifier, url: str, capture: Capture | None) -> None:
-    """Until cancelled, say how the node is and, as long as everything moves, that it lives."""
+async def keep_notified(
+    notifier: Notifier, url: str, capture: Capture | None, parts: Mapping[str, Beating]
+) -> None:
+    """Until cancelled, say how the node is and, as long as everything moves, that it lives.
+
+    parts : whose progress counts, by what they are called.
+    """
     tick_s = min(TICK_S, (notifier.watchdog_s or 4 * TICK_S) / 4)
     while True:
         notifier.status(status_text(url, capture))
         if notifier.watchdog_s is not None:
-            if trouble := stuck(capture, notifier.watchdog_s / 2):
+            if trouble := stuck(parts, notifier.watchdog_s / 2):
                 log.error("the watchdog is not fed: %s", trouble)
             else:
                 notifier.alive()
@@ -94,12 +113,14 @@ def status_text(url: str, capture: Capture | None) -> str:
     return f"Serving {url}, scanner: {doing}{': ' + status.why if status.why else ''}"
 
 
-def stuck(capture: Capture | None, patience_s: float, clock: Callable[[], float] = time.monotonic) -> str | None:
+def stuck(
+    parts: Mapping[str, Beating], patience_s: float, clock: Callable[[], float] = time.monotonic
+) -> str | None:
     """What does not get on any more, or None."""
-    silent_s = clock() - capture.beat_s if capture else 0.0
-    if silent_s <= patience_s:
-        return None
-    return f"the capture thread has not moved for {silent_s:.0f} s"
+    for name, part in parts.items():
+        if (silent_s := clock() - part.beat_s) > patience_s:
+            return f"{name} has not moved for {silent_s:.0f} s"
+    return None
 
 
 def _line(status: str) -> str:

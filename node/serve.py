@@ -172,6 +172,12 @@ class NodeServer:
         self.audit.note("scanned", NODE, scan=scan_id)
         self.publish(scan_id)
 
+    def use(self, config: Config) -> None:
+        """Go on with other settings, of those that `node.reload` lets change. Raises AccessError, and changes none."""
+        if self._tls is not None:
+            self._tls.use(config.server)
+        self._config = config
+
     def publish(self, scan_id: str) -> None:
         """Tell every client of a new scan."""
         for connection in self._connections:

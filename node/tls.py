@@ -7,6 +7,7 @@ since that is what paired clients know the node by.
 from __future__ import annotations
 
 import datetime as dt
+import os
 import socket
 import ssl
 from ipaddress import ip_address
@@ -29,6 +30,7 @@ VALID = dt.timedelta(days=800)  # Apple's devices take at most 825
 RENEW_BEFORE = dt.timedelta(days=60)
 CLOCK_SLACK = dt.timedelta(days=1)
 NAME_MAX = 64
+CREDENTIAL = "credential:"
 
 
 class Tls:
@@ -51,23 +53,44 @@ class Tls:
         """Renew what is due and take what was changed, for connections to come. Whether there was anything."""
         if self._server.certificate is None:
             renew_own(self._folder, self._node_id, self._server.host, dt.datetime.now(dt.UTC))
-        certificate, key = certificate_files(self._server, self._folder)
+        certificate, key = certificate_file(self._server, self._folder), key_file(self._server, self._folder)
         shown = certificate_fingerprint(certificate)
         if shown == self.fingerprint:
             return False
         try:
-            self.context.load_cert_chain(certificate, key)
+            for context in (ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), self.context):  # a trial spoils only itself
+                context.load_cert_chain(certificate, key)
         except (OSError, ssl.SSLError) as error:
             raise AccessError(f"{certificate} and {key} cannot be used: {error.strerror or error}") from error
         self.fingerprint = shown
         return True
 
+    def use(self, server: Server) -> None:
+        """Take other settings; where they cannot be used, nothing changes. Raises AccessError."""
+        before, self._server = self._server, server
+        try:
+            self.refresh()
+        except AccessError:
+            self._server = before
+            raise
 
-def certificate_files(server: Server, folder: Path) -> tuple[Path, Path]:
-    """Where the certificate and its key are."""
-    if server.certificate is None or server.key is None:
-        return folder / FILE, folder / FILE
-    return Path(server.certificate), Path(server.key)
+
+def certificate_file(server: Server, folder: Path) -> Path:
+    """Where the certificate is."""
+    return folder / FILE if server.certificate is None else Path(server.certificate)
+
+
+def key_file(server: Server, folder: Path) -> Path:
+    """Where its key is. Raises AccessError for a credential that systemd did not hand over (systemd.exec(5))."""
+    key = server.key
+    if key is None or not key.startswith(CREDENTIAL):
+        return folder / FILE if key is None else Path(key)
+    name, handed = key.removeprefix(CREDENTIAL), os.environ.get("CREDENTIALS_DIRECTORY")
+    if handed is None:
+        raise AccessError(f"server.key: no credentials here: only a service that loads {name!r} can read it")
+    if "/" in name or not (path := Path(handed, name)).is_file():
+        raise AccessError(f"server.key: no credential {name!r} was handed over: put it in /etc/credstore, and restart")
+    return path
 
 
 def read_certificate(path: Path) -> x509.Certificate:

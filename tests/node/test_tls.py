@@ -45,6 +45,37 @@ def test_one_that_ends_soon_or_is_not_valid_is_renewed_with_the_same_key(tmp_pat
     assert certificate.not_valid_before_utc <= NOW + later < certificate.not_valid_after_utc - RENEW_BEFORE
 
 
+def test_a_key_may_be_a_credential_that_systemd_hands_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    renew_own(tmp_path, "clinic", "::1", NOW)
+    handed = tmp_path / "credentials"
+    handed.mkdir()
+    server = Server(certificate=str(tmp_path / FILE), key="credential:foveascan.key")
+    monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
+    with pytest.raises(AccessError, match=r"^server\.key: no credentials here"):
+        Tls(server, tmp_path, "1234")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(handed))
+    with pytest.raises(AccessError, match=r"^server\.key: no credential 'foveascan.key' was handed over"):
+        Tls(server, tmp_path, "1234")
+    (handed / "foveascan.key").write_bytes((tmp_path / FILE).read_bytes())
+    assert Tls(server, tmp_path, "1234").fingerprint == certificate_fingerprint(tmp_path / FILE)
+    with pytest.raises(AccessError, match="no credential"):
+        Tls(Server(certificate=str(tmp_path / FILE), key=f"credential:../{FILE}"), tmp_path, "1234")
+
+
+def test_settings_that_cannot_be_used_change_nothing(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        renew_own(tmp_path / name, name, "::1", NOW)
+    a, b = (str(tmp_path / name / FILE) for name in ("a", "b"))
+    tls = Tls(Server(certificate=a, key=a), tmp_path, "1234")
+    for wrong in (Server(certificate=b, key=a), Server(certificate=b, key=str(tmp_path / "none"))):
+        with pytest.raises(AccessError, match="cannot be used"):
+            tls.use(wrong)
+        assert tls.fingerprint == certificate_fingerprint(Path(a)) and not tls.refresh()
+    tls.use(Server(certificate=b, key=b))
+    assert tls.fingerprint == certificate_fingerprint(Path(b))
+
+
 def test_a_clinics_own_certificate_is_shown_and_its_renewal_taken_up(tmp_path: Path) -> None:
     renew_own(tmp_path, "clinic", "::1", NOW)
     theirs = tmp_path / FILE

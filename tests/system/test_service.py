@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import socket
 import subprocess
 import time
@@ -85,6 +86,40 @@ def test_systemd_hears_ready_when_it_is_true_then_life_then_the_end(tmp_path: Pa
             assert hear(line, "STOPPING=1")
             assert node.wait(STOP_S) == 0
             assert time.monotonic() - began_s < STOP_S
+
+
+def test_sighup_takes_up_what_can_be_and_says_what_waits(tmp_path: Path) -> None:
+    settings = tmp_path / "node.toml"
+    library = f"[library]\nfolder = \"{tmp_path}/library\"\n"
+    serve = "[server]\nlisten = \"127.0.0.1:0\"\ninsecure = true\n"
+    settings.write_text(library + serve)
+    environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "n")}
+    command = [*PROGRAM, "serve", "--config", str(settings), "--json"]
+    with (
+        notification_socket(tmp_path / "n") as line,
+        subprocess.Popen(command, env=environ, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as node,
+    ):
+        assert node.stderr is not None
+        first = hear(line, "READY=1")["STATUS"]
+
+        def reload(text: str) -> str:
+            """What the log says after these settings were read."""
+            settings.write_text(text)
+            node.send_signal(signal.SIGHUP)
+            assert int(hear(line, "RELOADING=1")["MONOTONIC_USEC"]) <= time.monotonic_ns() // 1000
+            assert hear(line, "READY=1")["STATUS"] == first
+            assert node.stderr is not None
+            while "settings" not in (said := node.stderr.readline()):
+                pass
+            return said.split(": ", 1)[1].strip()
+
+        assert reload(library + serve + "max_clients = 1\nencode_workers = 1\n[log]\nlevel = \"warning\"\n") == (
+            "read the settings anew: server.max_clients, log.level changed; for server.encode_workers restart the node"
+        )
+        assert reload("max_clients = 3").startswith("the settings stay as they were: max_clients: unknown key")
+        assert reload(library + serve + "max_clients = 2").startswith("read the settings anew: server.max_clients, log")
+        node.terminate()
+        assert node.wait(STOP_S) == 0
 
 
 def test_a_node_that_cannot_listen_never_says_ready(tmp_path: Path) -> None:

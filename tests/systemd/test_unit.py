@@ -78,9 +78,11 @@ def test_user_folders_and_rule_name_one_account(tmp_path: Path) -> None:
     told = run(tool("systemd-sysusers"), "--dry-run", f"--root={tmp_path}", SYSTEMD / "sysusers.conf")
     assert "Creating user 'foveascan'" in told
     rules = [line for line in (SYSTEMD / "70-foveascan.rules").read_text().splitlines() if line and line[0] != "#"]
-    assert len(rules) == 2 and all('GROUP="foveascan", MODE="0660"' in rule for rule in rules)
+    *given, wakes = rules
+    assert len(given) == 2 and all('GROUP="foveascan", MODE="0660", TAG+="systemd"' in rule for rule in given)
     for kind in ("ttyACM", "ttyUSB", "usb_device"):
-        assert sum(kind in rule for rule in rules) == 1
+        assert sum(kind in rule for rule in given) == 1
+    assert wakes.endswith(f'ENV{{SYSTEMD_WANTS}}+="{UNIT.name}"')
     folders = {line.split()[1] for line in (SYSTEMD / "tmpfiles.conf").read_text().splitlines() if line[0] != "#"}
     assert folders == {"/var/lib/foveascan", "/etc/foveascan", "/etc/foveascan/node.toml"}
 
