@@ -61,7 +61,7 @@ def test_an_override_mends_a_file_that_would_be_refused_without_it(tmp_path: Pat
         ),
         (
             "[cap]\nbaud = 1",
-            "cap: unknown key; known here: capture, server, library, audit, first_view, planner, discovery",
+            "cap: unknown key; known here: capture, server, library, audit, first_view, planner, discovery, log",
         ),
         ("capture = 3", "capture: expected a table, got int"),
         ("[planner]\ncold_start_bytes_s = 0", "planner.cold_start_bytes_s: expected float >= 1000.0"),
