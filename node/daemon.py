@@ -162,7 +162,8 @@ def _capture(config: Config, library: Library, live: Live) -> tuple[Capture | No
 
     opened = partial(open_port, address, config.capture.baud)
     link = config_for(address, config.capture.stale_s)
-    return Capture(opened, link, deliver, live.watch, library.sweeps, sweep_request(config), config.capture.repair), announce
+    request, repair = sweep_request(config), config.capture.repair
+    return Capture(opened, link, deliver, live.watch, library.sweeps, request, repair), announce
 
 
 def sweep_request(config: Config) -> SweepRequest:
