@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exchange.errors import ExchangeError
+from exchange.rays import LevelRays, Rays, StarRays, rays_of
 from protocol.grid import STEPS_MAX, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray, mm_to_steps
 
 BAND_RAYS = 1 << 19
@@ -49,51 +50,6 @@ class Mesh:
     uv: NDArray[np.float32]
     colours: ImageArray
     images: tuple[ImageArray, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Lattice:
-    """Rays at column centres and row centres, all round, level."""
-
-    columns: int
-    rows: int
-    theta0_rad: float
-    z_max_mm: float
-    pitch_mm: float
-
-    def angle_rad(self, column: IntArray) -> FloatArray:
-        return self.theta0_rad + 2 * np.pi * (column + 0.5) / self.columns
-
-    def bounds(self, corners: FloatArray) -> _Bounds:
-        return _bounds(corners, self)
-
-    def from_ray(self, out: FloatArray, z: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Of places at (out, z) in the ray's half plane: how far off the ray, and how far along it. [mm]"""
-        return z - (self.z_max_mm - (row.astype(np.float64) + 0.5) * self.pitch_mm), out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Star:
-    """Rays at column centres and at the polar angles of row centres, all from one point on the axis."""
-
-    columns: int
-    rows: int
-    theta0_rad: float
-    centre_mm: float
-
-    def angle_rad(self, column: IntArray) -> FloatArray:
-        return self.theta0_rad + 2 * np.pi * (column + 0.5) / self.columns
-
-    def bounds(self, corners: FloatArray) -> _Bounds:
-        return _cap_bounds(corners, self)
-
-    def from_ray(self, out: FloatArray, z: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
-        polar = np.pi * (row.astype(np.float64) + 0.5) / self.rows
-        sin, cos, up = np.sin(polar), np.cos(polar), z - self.centre_mm
-        return out * cos - up * sin, out * sin + up * cos
-
-
-_Rays = _Lattice | _Star
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +94,7 @@ def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: Non
     progress : called with the share done, 0..1.
     Raises ExchangeError for a mesh that meets no ray, or needs more than TRIALS_MAX trials.
     """
-    ranges, texels = _rays(spec, spec.width, spec.height), _rays(spec, spec.texture_width, spec.texture_height)
+    ranges, texels = rays_of(spec, spec.width, spec.height), rays_of(spec, spec.texture_width, spec.texture_height)
     share = ranges.columns * ranges.rows / (ranges.columns * ranges.rows + texels.columns * texels.rows)
     radius_mm = np.full((spec.height, spec.width), np.nan)
     for rows, hits in _cast(mesh, ranges, lambda done: progress(share * done)):
@@ -151,13 +107,6 @@ def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: Non
     return Grid(spec, to_steps(radius_mm, spec.step_mm), texture)
 
 
-def _rays(spec: GridSpec, columns: int, rows: int) -> _Rays:
-    """The rays of one channel."""
-    if spec.geometry == "sphere":
-        return _Star(columns, rows, spec.theta0_rad, spec.z_max_mm)
-    return _Lattice(columns, rows, spec.theta0_rad, spec.z_max_mm, spec.height * spec.pitch_mm / rows)
-
-
 def to_steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
     """Ranges as steps. What is nearer to the axis than half a step stays measured, at one step."""
     try:
@@ -166,9 +115,9 @@ def to_steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
         raise ExchangeError(f"vertices: {problem}") from problem
 
 
-def _cast(mesh: Mesh, lattice: _Rays, progress: Progress) -> Iterator[tuple[slice, _Hits]]:
+def _cast(mesh: Mesh, lattice: Rays, progress: Progress) -> Iterator[tuple[slice, _Hits]]:
     """The rows of a lattice in bands, each with what its rays hit."""
-    bounds = lattice.bounds(mesh.corners)
+    bounds = _bounds(mesh.corners, lattice)
     trials = float(np.sum((bounds.right - bounds.left + 1.0) * np.maximum(bounds.bottom - bounds.top + 1, 0)))
     if trials > TRIALS_MAX:
         raise ExchangeError(
@@ -181,7 +130,12 @@ def _cast(mesh: Mesh, lattice: _Rays, progress: Progress) -> Iterator[tuple[slic
         progress(rows.stop / lattice.rows)
 
 
-def _bounds(corners: FloatArray, lattice: _Lattice) -> _Bounds:
+def _bounds(corners: FloatArray, rays: Rays) -> _Bounds:
+    """Rays each face may meet."""
+    return _level_bounds(corners, rays) if isinstance(rays, LevelRays) else _cap_bounds(corners, rays)
+
+
+def _level_bounds(corners: FloatArray, lattice: LevelRays) -> _Bounds:
     """Rays each face may meet. A face round the axis, or with an edge through it, is tried at every angle."""
     turn = lattice.columns / (2 * math.pi)
     at = (np.arctan2(corners[..., 1], corners[..., 0]) - lattice.theta0_rad) * turn - 0.5
@@ -198,7 +152,7 @@ def _bounds(corners: FloatArray, lattice: _Lattice) -> _Bounds:
     return _Bounds(left, right, np.maximum(top, 0), np.minimum(bottom, lattice.rows - 1))
 
 
-def _cap_bounds(corners: FloatArray, star: _Star) -> _Bounds:
+def _cap_bounds(corners: FloatArray, star: StarRays) -> _Bounds:
     """Rays each face may meet: those into a cap round its corners, as the centre sees it."""
     towards = corners - np.array([0.0, 0.0, star.centre_mm])
     towards /= np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), TINY)
@@ -227,7 +181,7 @@ def _whole(places: FloatArray) -> tuple[IntArray, IntArray]:
     return first.astype(np.int64), last.astype(np.int64)
 
 
-def _hit_band(corners: FloatArray, lattice: _Rays, bounds: _Bounds, rows: slice) -> _Hits:
+def _hit_band(corners: FloatArray, lattice: Rays, bounds: _Bounds, rows: slice) -> _Hits:
     rays = (rows.stop - rows.start) * lattice.columns
     hits = _Hits(np.full(rays, np.nan), np.zeros(rays, np.int64), np.zeros((rays, 3)))
     top, bottom = np.maximum(bounds.top, rows.start), np.minimum(bounds.bottom, rows.stop - 1)
@@ -263,7 +217,7 @@ def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _meet(
-    corners: FloatArray, lattice: _Rays, face: IntArray, row: IntArray, column: IntArray
+    corners: FloatArray, lattice: Rays, face: IntArray, row: IntArray, column: IntArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Whether each ray meets its face, at what range, and with what weights of the corners."""
     angle = lattice.angle_rad(np.arange(lattice.columns))

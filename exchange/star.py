@@ -59,7 +59,7 @@ def close_mesh(
     mean_mm = spec.step_mm * float(grid.range_steps[_measured(grid)].mean())
     spec = replace(spec, pitch_mm=math.pi * mean_mm / spec.height)
     grid = Grid(spec, thin_rings(grid.range_steps), grid.texture)
-    seen = Seen(centre_mm, _hidden(mesh.corners, grid), _open(grid))
+    seen = Seen(centre_mm, _hidden(mesh.corners, grid), solid_share(~_measured(grid)))
     if seen.open > OPEN_MAX:
         raise ExchangeError(f"mesh: {seen.open:.1%} of all directions meet nothing; it is not closed: a cylinder?")
     if seen.hidden > HIDDEN_MAX:
@@ -119,15 +119,16 @@ def _measured(grid: Grid) -> BoolArray:
     return np.not_equal(grid.range_steps, VOID)
 
 
-def _open(grid: Grid) -> float:
-    """Share of all directions, by solid angle, that meet nothing."""
-    solid = np.sin(DirectionGrid.of(grid.spec).theta_v(np.arange(grid.spec.height)))
-    return float((~_measured(grid)).mean(axis=1) @ solid / solid.sum())
+def solid_share(chosen: BoolArray) -> float:
+    """Share of all directions, by solid angle, of those that are set. (H, W)"""
+    height = len(chosen)
+    solid = np.sin(np.pi * (np.arange(height) + 0.5) / height)
+    return float(chosen.mean(axis=1) @ solid / solid.sum())
 
 
 def _hidden(corners: FloatArray, grid: Grid) -> float:
     """Share of a mesh's area whose middles lie below the surface that the grid has in their direction."""
-    nearest = _nearest_round(grid)
+    nearest = nearest_round(grid)
     hidden_mm2 = area_mm2 = 0.0
     for first in range(0, len(corners), FACES_AT_ONCE):
         faces = corners[first : first + FACES_AT_ONCE] - np.array([0.0, 0.0, grid.spec.z_max_mm])
@@ -141,7 +142,7 @@ def _hidden(corners: FloatArray, grid: Grid) -> float:
     return hidden_mm2 / area_mm2 if area_mm2 else 0.0
 
 
-def _nearest_round(grid: Grid) -> FloatArray:
+def nearest_round(grid: Grid) -> FloatArray:
     """The least range of each sample and its neighbours, so that a steep side does not count as hidden. (H, W) [mm]"""
     far = np.where(_measured(grid), grid.range_steps, STEPS_MAX).astype(np.float64) * grid.spec.step_mm
     across = np.minimum(np.minimum(np.roll(far, 1, 1), np.roll(far, -1, 1)), far)
