@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from client.arguments import add_node, chosen_node, number, positive
+from protocol.printable import printable
 
 if TYPE_CHECKING:
     from client.transfer import Moved
-    from exchange.formats import MeshOptions, Size
-    from protocol.grid import Grid
+    from exchange.formats import ReadOptions, Size
+    from exchange.native import Scanned
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -31,6 +32,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     bring.add_argument("--texture", type=Path, metavar="IMAGE", help="its colour, where the file does not hold it")
     bring.add_argument("--name", help="what to call it (the file's own name)")
     bring.add_argument("-o", "--output", type=Path, metavar="GRID", help="write a .npz grid instead of sending it")
+    _add_geometry(bring)
     _add_mesh(bring)
     add_node(bring)
     bring.set_defaults(run=run_import)
@@ -58,16 +60,19 @@ def run_import(args: argparse.Namespace) -> int:
     if args.output:
         _check_grid(args.output)
     with _bar(args, "reading") as moved:
-        options = _mesh_options(args)
-        name, grid = read_scan(args.file, args.texture, options, lambda share: moved(round(1000 * share), 1000))
+        options = _read_options(args)
+        found = read_scan(args.file, args.texture, options, lambda share: moved(round(1000 * share), 1000))
+    found = found._replace(name=args.name or found.name)
+    spec = found.grid.spec
     if args.output:
-        _write(args.output, args.name or name, grid)
+        _write(args.output, found)
         record = {"file": str(args.output)}
-        line = f"{args.output}: {grid.spec.width} x {grid.spec.height}"
+        line = f"{args.output}: {spec.geometry}, {spec.width} x {spec.height}"
     else:
-        scan = asyncio.run(_import(args, args.name or name, grid))
-        record, line = {"scan": scan}, f"scan {scan}"
-    print(json.dumps(record) if args.json else line, flush=True)
+        scan = asyncio.run(_import(args, found))
+        record, line = {"scan": scan}, f"scan {scan}: {spec.geometry}"
+    record |= {"geometry": spec.geometry, "note": found.note}
+    print(json.dumps(record) if args.json else "\n".join(filter(None, (line, printable(found.note)))), flush=True)
     return 0
 
 
@@ -79,7 +84,7 @@ async def _export(args: argparse.Namespace) -> int:
         return await fetch_scan(node, args.scan, args.file, token=args.token, moved=moved)
 
 
-async def _import(args: argparse.Namespace, name: str, grid: Grid) -> str:
+async def _import(args: argparse.Namespace, found: Scanned) -> str:
     import tempfile
 
     from client.transfer import send_scan
@@ -87,7 +92,7 @@ async def _import(args: argparse.Namespace, name: str, grid: Grid) -> str:
 
     node = await chosen_node(args)
     with tempfile.TemporaryFile() as file, _bar(args, "sending") as moved:
-        write_native(grid, file, name)
+        write_native(found.grid, file, found.name, found.note)
         return await send_scan(node, file, token=args.token, moved=moved)
 
 
@@ -100,20 +105,21 @@ def _check_grid(path: Path) -> None:
     check_place(path)
 
 
-def _write(path: Path, name: str, grid: Grid) -> None:
+def _write(path: Path, found: Scanned) -> None:
     from exchange.native import write_native
     from exchange.whole_file import whole_file
 
     with whole_file(path) as file:
-        write_native(grid, file, name)
+        write_native(found.grid, file, found.name, found.note)
 
 
-def _mesh_options(args: argparse.Namespace) -> MeshOptions:
-    from exchange.formats import MeshOptions
+def _read_options(args: argparse.Namespace) -> ReadOptions:
+    from exchange.formats import ReadOptions
     from exchange.mesh_file import Placing
 
     placing = Placing(args.up, args.unit_mm, args.centre)
-    return MeshOptions(args.size, placing, math.radians(args.theta0_deg), args.geometry)
+    theta0_rad = math.radians(args.theta0_deg)
+    return ReadOptions(args.size, placing, theta0_rad, args.geometry, args.caps, args.centre_height)
 
 
 @contextmanager
@@ -131,6 +137,19 @@ def _bar(args: argparse.Namespace, what: str) -> Iterator[Moved]:
         yield moved
 
 
+def _add_geometry(parser: argparse.ArgumentParser) -> None:
+    geometry = parser.add_argument_group("geometry", "whether it is seen from an axis, or from a centre inside it")
+    geometry.add_argument(
+        "--geometry", choices=("cylinder", "sphere"), help="(a grid as it is; a mesh as a sphere if it is closed)"
+    )
+    geometry.add_argument(
+        "--caps", action="store_true", help="of a cylinder as a sphere: make up lids over ends that are open"
+    )
+    geometry.add_argument(
+        "--centre-height", type=number, metavar="MM", help="of a sphere's centre, up the axis (chosen)"
+    )
+
+
 def _add_mesh(parser: argparse.ArgumentParser) -> None:
     mesh = parser.add_argument_group("meshes", "what a mesh does not say itself")
     mesh.add_argument(
@@ -139,9 +158,6 @@ def _add_mesh(parser: argparse.ArgumentParser) -> None:
     mesh.add_argument("--up", choices=("z", "y", "x", "-z", "-y", "-x"), help="the axis that points up (z; glTF: y)")
     mesh.add_argument("--unit-mm", type=positive, metavar="MM", help="millimetres of its unit (1; glTF: 1000)")
     mesh.add_argument("--centre", action="store_true", help="put its middle on the turntable's axis")
-    mesh.add_argument(
-        "--geometry", choices=("cylinder", "sphere"), default="cylinder", help="sphere: closed, seen from inside"
-    )
     mesh.add_argument("--theta0-deg", type=number, default=0.0, metavar="DEG", help="angle of the seam (0)")
 
 

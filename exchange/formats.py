@@ -13,6 +13,7 @@ from protocol.grid import Geometry, Grid, ImageArray
 
 if TYPE_CHECKING:
     from exchange.mesh_file import Placing
+    from exchange.native import Scanned
 
 Writer = Callable[[Grid, BinaryIO], None]
 Size = tuple[int, int, int, int]  # W, H, Wt, Ht
@@ -37,16 +38,25 @@ SIZES: Mapping[str, Size] = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True)
-class MeshOptions:
-    """What a mesh does not say itself. size : W, H, Wt, Ht.  placing : None: as its format demands.  See fit_spec.
+class ReadOptions:
+    """What a file does not say itself.
 
-    geometry : "sphere" for a closed object, seen from a centre inside it (exchange.star).
+    size : W, H, Wt, Ht a mesh is cast on.  placing : of a mesh; None: as its format demands.  theta0_rad : see fit_spec.
+    geometry : as what it is wanted; None: a grid as it is, a mesh as a sphere if it is closed and hides little of
+    itself from its centre, else as a cylinder.  caps : make up lids over a cylinder's open ends (exchange.closing).
+    centre_mm : height of a sphere's centre; None: chosen.  Raises ExchangeError for what only a sphere has.
     """
 
     size: Size = SIZES["M"]
     placing: Placing | None = None
     theta0_rad: float = 0.0
-    geometry: Geometry = "cylinder"
+    geometry: Geometry | None = None
+    caps: bool = False
+    centre_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.geometry != "sphere" and (self.caps or self.centre_mm is not None):
+            raise ExchangeError("caps and a centre go with a sphere: --geometry sphere")
 
 
 def suffix_of(name: str | Path) -> str:
@@ -77,56 +87,82 @@ def writer_of(suffix: str) -> Writer:
 def read_scan(
     path: Path,
     texture_path: Path | None = None,
-    options: MeshOptions = MeshOptions(),
+    options: ReadOptions = ReadOptions(),
     progress: Callable[[float], object] = lambda share: None,
-) -> tuple[str, Grid]:
-    """A scan and its name, from a grid (.npz), an Echo file (known by its content), a mesh or points.
+) -> Scanned:
+    """A scan from a grid (.npz), an Echo file (known by its content), a mesh or points.
 
     texture_path : its colour; an Echo file takes the image of its own name beside it.  progress : share done, 0..1.
     Raises ExchangeError that names the file and the field at fault, OSError for a file that cannot be opened.
     """
     try:
-        name, grid = _read(path, texture_path, options, progress)
+        found = _read(path, texture_path, options, progress)
     except ExchangeError as problem:
         raise problem if str(path) in str(problem) else ExchangeError(f"{path}: {problem}") from problem
-    return name or path.stem, grid
+    return found if found.name else found._replace(name=path.stem)
 
 
 def _read(
-    path: Path, texture_path: Path | None, options: MeshOptions, progress: Callable[[float], object]
-) -> tuple[str, Grid]:
+    path: Path, texture_path: Path | None, options: ReadOptions, progress: Callable[[float], object]
+) -> Scanned:
     from exchange.echo import HEADER_BYTES_MAX, is_echo, read_echo
-    from exchange.native import read_native
+    from exchange.native import Scanned, read_native
 
     with open(path, "rb") as file:
         head = file.read(HEADER_BYTES_MAX)
         file.seek(0)
         if path.suffix.lower() == ".npz":
-            return read_native(file, _image(texture_path))
+            return as_wanted(read_native(file, _image(texture_path)), options, progress)
         if is_echo(head):
-            return "", read_echo(file, _image(texture_path or _image_beside(path)))
-    return "", _read_mesh(path, _image(texture_path), options, progress)
+            grid = read_echo(file, _image(texture_path or _image_beside(path)))
+            return as_wanted(Scanned("", grid), options, progress)
+    return _read_mesh(path, _image(texture_path), options, progress)
+
+
+def as_wanted(
+    found: Scanned, options: ReadOptions, progress: Callable[[float], object] = lambda share: None
+) -> Scanned:
+    """A grid in the geometry that is wanted, itself where it has it already. Raises ExchangeError where it has none."""
+    from exchange.closing import close_scan
+    from exchange.unrolling import unroll
+
+    if options.geometry in (None, found.grid.spec.geometry):
+        return found
+    if options.geometry == "cylinder":
+        return found._replace(grid=unroll(found.grid), note=joined(found.note, "a sphere as its axis sees it"))
+    closed, said = close_scan(
+        found.grid, caps=options.caps, centre_mm=options.centre_mm, progress=progress
+    )
+    return found._replace(grid=closed, note=joined(found.note, str(said)))
+
+
+def joined(*notes: str) -> str:
+    """Notes one behind the other."""
+    return ". ".join(note for note in notes if note)
 
 
 def _read_mesh(
-    path: Path, texture: ImageArray | None, options: MeshOptions, progress: Callable[[float], object]
-) -> Grid:
+    path: Path, texture: ImageArray | None, options: ReadOptions, progress: Callable[[float], object]
+) -> Scanned:
     from exchange.cast import cast_mesh, fit_spec
     from exchange.mesh_file import SUFFIXES, Placing, read_mesh
+    from exchange.native import Scanned
     from exchange.points import Points, bin_points
-    from exchange.star import close_mesh
+    from exchange.star import close_mesh, star_centre
 
     if path.suffix.lower() not in SUFFIXES:
         raise ExchangeError(f"no scan: expected an Echo file, .npz, {', '.join(SUFFIXES)}")
     found = read_mesh(path, options.placing or Placing(), texture)
-    if options.geometry == "sphere":
-        if isinstance(found, Points):
-            raise ExchangeError("points are not closed: a sphere is made of triangles")
-        return close_mesh(found, options.size, options.theta0_rad, progress=progress)[0]
     if isinstance(found, Points):
+        if options.geometry == "sphere":
+            raise ExchangeError("points are not closed: a sphere is made of triangles")
         size = *options.size[:2], *options.size[:2]  # a point colours one texel: more of them would be gaps
-        return bin_points(found, fit_spec(found.positions, size, options.theta0_rad))
-    return cast_mesh(found, fit_spec(found.corners, options.size, options.theta0_rad), progress)
+        return Scanned("", bin_points(found, fit_spec(found.positions, size, options.theta0_rad)))
+    centre_mm = star_centre(found) if options.geometry is None else options.centre_mm
+    if options.geometry == "sphere" or centre_mm is not None:
+        grid, seen = close_mesh(found, options.size, options.theta0_rad, centre_mm, progress)
+        return Scanned("", grid, str(seen))
+    return Scanned("", cast_mesh(found, fit_spec(found.corners, options.size, options.theta0_rad), progress))
 
 
 def _image(path: Path | None) -> ImageArray | None:

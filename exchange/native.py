@@ -7,6 +7,7 @@
     pitch_mm    height of a row, exactly; optional: (z_max_mm - z_min_mm) / H, which may be off by a rounding
     repairs     (n, 3) int32, range cells that are not as they were measured, row by row: row, column, steps measured
                 there (0 = nothing); optional
+    note        how the scan was made, where its geometry is not as it was measured; optional
     geometry    "sphere" for directions from a centre at z_max_mm on the axis, rings thinned; optional: "cylinder"
 
 The keys are those of make_cyl.py. What a member says of its shape is checked before anything is allocated.
@@ -17,7 +18,7 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +28,29 @@ from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Geometry, Grid, GridSpec, Image
 from protocol.rings import thin_rings
 
 NAME_MAX = 200
+NOTE_MAX = 1000
 MEMBERS_MAX = 64
 ARRAY_BYTES_MAX = WIDTH_MAX * HEIGHT_MAX * 3
 PITCH_TOLERANCE = 1e-9
 Shape = tuple[int, ...]
 
 
-def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
+class Scanned(NamedTuple):
+    """A scan as a file brings it. name : "" where it has none.  note : what is to be known of how it was made."""
+
+    name: str
+    grid: Grid
+    note: str = ""
+
+
+def write_native(grid: Grid, file: BinaryIO, name: str = "", note: str = "") -> None:
     """Write a grid so that `read_native` gives the very same one."""
     spec = grid.spec
     optional: dict[str, Any] = {} if spec.geometry == "cylinder" else {"geometry": np.str_(spec.geometry)}
     if grid.repairs.size:
         optional["repairs"] = np.asarray(grid.repairs, "<i4")
+    if note:
+        optional["note"] = np.str_(note[:NOTE_MAX])
     np.savez(
         file,
         depth_u16=np.asarray(grid.range_steps, "<u2"),
@@ -55,8 +67,8 @@ def write_native(grid: Grid, file: BinaryIO, name: str = "") -> None:
 
 def read_native(
     file: BinaryIO, texture: ImageArray | None = None, array_bytes_max: int = ARRAY_BYTES_MAX
-) -> tuple[str, Grid]:
-    """A grid and its name ("" where the file has none).
+) -> Scanned:
+    """A grid, with its name and note.
 
     texture : taken instead of the file's own.    array_bytes_max : bound on each array, checked before it is read.
     Raises ExchangeError that names the member at fault.
@@ -116,7 +128,7 @@ def _header(member: BinaryIO) -> tuple[Shape, bool, np.dtype[Any]]:
     raise ValueError(f"version {version} of the array format")
 
 
-def _read(members: _Members, texture: ImageArray | None) -> tuple[str, Grid]:
+def _read(members: _Members, texture: ImageArray | None) -> Scanned:
     if texture is None and "texture" not in members:
         raise ExchangeError("texture: missing; give its image with --texture")
     depth = members.array("depth_u16", 2, np.uint16).astype(np.uint16, copy=False)
@@ -125,7 +137,8 @@ def _read(members: _Members, texture: ImageArray | None) -> tuple[str, Grid]:
         spec = _spec(members, depth.shape, texels.shape)
         if spec.geometry == "sphere" and not np.array_equal(depth, thin_rings(depth)):
             raise ExchangeError("depth_u16: a sphere's rings near the poles must be thinned (protocol/rings.py)")
-        return _name(members), Grid(spec, depth, texels, _repairs(members))
+        grid = Grid(spec, depth, texels, _repairs(members))
+        return Scanned(_text(members, "name", NAME_MAX), grid, _text(members, "note", NOTE_MAX))
     except ValueError as problem:
         raise ExchangeError(str(problem)) from problem
 
@@ -157,10 +170,10 @@ def _repairs(members: _Members) -> RepairArray:
     return members.array("repairs", 2, np.int32).astype(np.int32, copy=False)
 
 
-def _name(members: _Members) -> str:
-    if "name" not in members:
+def _text(members: _Members, key: str, length_max: int) -> str:
+    if key not in members:
         return ""
-    name = str(members.array("name", 0, np.str_))
-    if len(name) > NAME_MAX:
-        raise ExchangeError(f"name: {len(name)} characters, at most {NAME_MAX}")
-    return name
+    text = str(members.array(key, 0, np.str_))
+    if len(text) > length_max:
+        raise ExchangeError(f"{key}: {len(text)} characters, at most {length_max}")
+    return text

@@ -19,6 +19,7 @@ from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec
 from protocol.rings import thin_rings
 from protocol.sphere import DirectionGrid, directions
 
+LOOK = (180, 90, 1, 1)  # rays that tell whether a mesh is closed
 CANDIDATES = 17  # heights tried as centre
 HIDDEN_MAX = 0.05  # of the surface
 OPEN_MAX = 0.02  # of all directions
@@ -35,6 +36,19 @@ class Seen:
     centre_mm: float
     hidden: float
     open: float
+
+    def __str__(self) -> str:
+        parts = ((self.hidden, "of its surface hidden from there"), (self.open, "of all directions void"))
+        said = "".join(f"; {share:.1%} {what}" for share, what in parts if share >= 0.0005)
+        return f"a closed mesh seen from a centre at {self.centre_mm:.1f} mm{said}"
+
+
+def star_centre(mesh: Mesh) -> float | None:
+    """The height of a centre from which a closed mesh is seen whole, or nearly; None where there is none."""
+    try:
+        return close_mesh(mesh, LOOK)[1].centre_mm
+    except ExchangeError:
+        return None
 
 
 def close_mesh(
@@ -61,11 +75,14 @@ def close_mesh(
     grid = Grid(spec, thin_rings(grid.range_steps), grid.texture)
     seen = Seen(centre_mm, _hidden(mesh.corners, grid), solid_share(~_measured(grid)))
     if seen.open > OPEN_MAX:
-        raise ExchangeError(f"mesh: {seen.open:.1%} of all directions meet nothing; it is not closed: a cylinder?")
+        raise ExchangeError(
+            f"mesh: {seen.open:.1%} of all directions meet nothing, more than {OPEN_MAX:.0%}; "
+            "it is not closed: close it, or import it as a cylinder (--geometry cylinder)"
+        )
     if seen.hidden > HIDDEN_MAX:
         raise ExchangeError(
             f"mesh: {seen.hidden:.1%} of its surface is hidden from its centre, more than {HIDDEN_MAX:.0%}; "
-            "it is not star-shaped: serve it as a mesh"
+            "it is not star-shaped: import it as a cylinder (--geometry cylinder)"
         )
     return grid, seen
 

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from exchange.formats import SIZES, MeshOptions, read_scan
+from exchange.formats import SIZES, ReadOptions, read_scan
 from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from simulators import shapes
@@ -87,7 +87,8 @@ def make_specimen(
 def _from_file(path: Path, size: str, texture_path: Path | None) -> Specimen:
     if not path.suffix and not path.exists():
         raise ConfigError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no file")
-    return Specimen(*read_scan(path, texture_path, MeshOptions(SIZES[size])))
+    found = read_scan(path, texture_path, ReadOptions(SIZES[size], geometry="cylinder"))
+    return Specimen(found.name, found.grid)
 
 
 def _columns_about(angle_rad: float, theta0_rad: float, width: int) -> tuple[int, int, float]:

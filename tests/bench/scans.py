@@ -59,7 +59,7 @@ def load(specimen: str, size: str, texture: str | None = None) -> BenchScan:
     if specimen in GENERATORS:
         return BenchScan(specimen, size, make_specimen(specimen, size).grid)
     if specimen not in REAL:
-        name, grid = read_scan(Path(specimen), Path(texture) if texture else None)
+        name, grid, _ = read_scan(Path(specimen), Path(texture) if texture else None)
         return BenchScan(name, "file", grid)
     if size not in SHAPES:
         raise Skipped(f"{specimen}: exists at {' and '.join(SHAPES)} only")

@@ -17,7 +17,7 @@ GRID = synthetic_grid()
 def test_npz_holds_the_very_same_grid(tmp_path: Path) -> None:
     export.write_grid(GRID, tmp_path / "model.npz")
     with open(tmp_path / "model.npz", "rb") as file:
-        _, back = read_native(file)
+        _, back, _ = read_native(file)
     assert back.spec == SPEC and np.array_equal(back.range_steps, GRID.range_steps)
     assert np.array_equal(back.texture, GRID.texture)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from exchange import cast
 from exchange.cast import Mesh, cast_mesh, fit_spec
 from exchange.errors import ExchangeError
-from exchange.formats import MeshOptions, read_scan, writer_of
+from exchange.formats import ReadOptions, read_scan, writer_of
 from exchange.mesh import GridMesh, Seam
 from exchange.mesh_file import Placing
 from exchange.mesh_file import read_mesh as read_anything
@@ -306,7 +306,7 @@ def test_points_are_binned_to_the_cells_they_are_seen_in(tmp_path: Path) -> None
     assert np.array_equal(back.range_steps != VOID, grid.range_steps != VOID)
     assert np.abs(back.range_steps.astype(int) - grid.range_steps).max() <= 1
     assert np.array_equal(back.texture[grid.range_steps != VOID], mesh.colours(band))
-    name, fitted = read_scan(tmp_path / "vase.ply", None, MeshOptions((48, 29, 9, 9), theta0_rad=0.4))
+    name, fitted, _ = read_scan(tmp_path / "vase.ply", None, ReadOptions((48, 29, 9, 9), theta0_rad=0.4))
     assert name == "vase" and fitted.texture.shape == (29, 48, 3)
 
 

@@ -178,12 +178,12 @@ def test_a_scan_turned_by_whole_columns_is_closed_turned() -> None:
 
 def test_of_several_hits_the_outermost_counts() -> None:
     """A narrow waist with a wide brim above it: rays through the brim's underside meet it once more outside."""
-    brim = scan(lambda z: np.where(np.abs(z - 20) < 4, 44.0, 40.0), -75, 75)
+    brim = scan(lambda z: np.where(np.abs(z - 40) < 4, 44.5, 40.0), -75, 75)
     closed, said = close_scan(brim, caps=True, centre_mm=0.0)
     v = polar(closed)
-    up_mm = np.tan(np.pi / 2 - v) * 44
-    on_brim = (up_mm > 17) & (up_mm < 23)
-    np.testing.assert_allclose(closed.range_mm[on_brim, 0], 44 / np.sin(v[on_brim]), rtol=0.002)
+    up_mm = np.tan(np.pi / 2 - v) * 44.5
+    on_brim = (up_mm > 37.5) & (up_mm < 42.5)
+    np.testing.assert_allclose(closed.range_mm[on_brim, 0], 44.5 / np.sin(v[on_brim]), rtol=0.002)
     assert 0.005 < said.hidden < 0.05  # the brim's underside, and the side in its shadow
 
 

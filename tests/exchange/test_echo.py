@@ -76,7 +76,7 @@ def test_its_colour_image_beside_it_is_turned_with_it(tmp_path: Path) -> None:
     image = np.zeros((NLT, NLG, 3), np.uint8)
     image[0, 1] = (10, 20, 200)  # the highest latitude of longitude 1
     cv2.imwrite(str(tmp_path / "head.png"), image[..., ::-1])
-    name, grid = read_scan(tmp_path / "head.echo")
+    name, grid, _ = read_scan(tmp_path / "head.echo")
     assert name == "head" and tuple(grid.texture[0, NLG - 2]) == (10, 20, 200)
     assert grid.range_steps[0, NLG - 2] == RADII[1, NLT - 1]
 

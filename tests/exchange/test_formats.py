@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from exchange.errors import ExchangeError
-from exchange.formats import MeshOptions, read_scan, suffix_of
+from exchange.formats import ReadOptions, read_scan, suffix_of
 from exchange.image import encode_png, read_image
 from exchange.whole_file import check_place, whole_file
 
@@ -29,7 +29,7 @@ def test_other_suffixes_are_refused_with_those_we_write(name: str) -> None:
 def test_a_mesh_is_cast_on_the_size_asked_for(tmp_path: Path) -> None:
     trimesh.creation.icosphere(radius=20).export(tmp_path / "ball.stl")
     shares: list[float] = []
-    name, grid = read_scan(tmp_path / "ball.stl", None, MeshOptions((36, 20, 48, 24), theta0_rad=1.0), shares.append)
+    name, grid, _ = read_scan(tmp_path / "ball.stl", None, ReadOptions((36, 20, 48, 24), theta0_rad=1.0), shares.append)
     assert name == "ball" and grid.range_steps.shape == (20, 36) and grid.texture.shape == (24, 48, 3)
     assert grid.spec.theta0_rad == 1.0 and shares[-1] == 1
 

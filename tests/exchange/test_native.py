@@ -38,7 +38,7 @@ def packed(**changed: Any) -> io.BytesIO:
 def test_a_grid_comes_back_bit_for_bit(grid: Grid) -> None:
     file = io.BytesIO()
     write_native(grid, file, "vase")
-    name, back = read_native(file)
+    name, back, _ = read_native(file)
     assert name == "vase" and back.spec == grid.spec
     assert np.array_equal(back.range_steps, grid.range_steps) and np.array_equal(back.texture, grid.texture)
 
@@ -58,7 +58,7 @@ def test_repairs_come_back_and_only_where_the_grid_has_such_cells() -> None:
 def test_a_grid_as_make_cyl_writes_it_with_its_image_beside(tmp_path: Path) -> None:
     (tmp_path / "grid.npz").write_bytes(packed(meta="{}").getvalue())
     cv2.imwrite(str(tmp_path / "colour.png"), TEXTURE[..., ::-1])
-    name, grid = read_scan(tmp_path / "grid.npz", tmp_path / "colour.png")
+    name, grid, _ = read_scan(tmp_path / "grid.npz", tmp_path / "colour.png")
     spec = grid.spec
     assert name == "bust" and np.array_equal(grid.range_steps, FIELDS["depth_u16"])
     assert (spec.step_mm, spec.pitch_mm, spec.z_max_mm, spec.theta0_rad) == (0.01, 5.0, 25.0, 0.5)

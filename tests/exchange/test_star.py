@@ -14,7 +14,7 @@ import trimesh
 
 from exchange.cast import Mesh
 from exchange.errors import ExchangeError
-from exchange.formats import MeshOptions, read_scan
+from exchange.formats import ReadOptions, read_scan
 from exchange.mesh import GridMesh, Seam
 from exchange.native import read_native, write_native
 from exchange.star import choose_centre, close_mesh, turns_round
@@ -159,15 +159,15 @@ def test_a_mesh_of_a_sphere_is_cast_back_to_it_within_a_step() -> None:
 
 def test_a_closed_mesh_file_becomes_a_sphere_on_demand(tmp_path: Path) -> None:
     ball().export(tmp_path / "ball.ply")
-    _, grid = read_scan(tmp_path / "ball.ply", options=MeshOptions(SIZE, geometry="sphere"))
+    _, grid, _ = read_scan(tmp_path / "ball.ply", options=ReadOptions(SIZE, geometry="sphere"))
     assert grid.spec.geometry == "sphere"
-    assert read_scan(tmp_path / "ball.ply", options=MeshOptions(SIZE))[1].spec.geometry == "cylinder"
+    assert read_scan(tmp_path / "ball.ply", options=ReadOptions(SIZE))[1].spec.geometry == "cylinder"
 
 
 def test_a_spherical_grid_file_comes_back_and_must_be_thinned() -> None:
     file = io.BytesIO()
     write_native(potato(), file, "potato")
-    name, grid = read_native(file)
+    name, grid, _ = read_native(file)
     assert (name, grid.spec) == ("potato", potato().spec)
     steps = grid.range_steps.copy()
     steps[0, 1] += 1

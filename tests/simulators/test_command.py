@@ -78,7 +78,7 @@ def test_it_serves_sweep_after_sweep_of_exactly_the_truth_it_wrote(tmp_path: Pat
     link, truth = tmp_path / "scanner", tmp_path / "truth.npz"
     with simulated(link, *FAST, "--truth", str(truth)) as (_, ready):
         assert ready["ready"] is True and ready["path"] == str(link)
-        name, grid = read_scan(truth)
+        name, grid, _ = read_scan(truth)
         assert name == "cylinder"
         for _ in range(2):
             assert sweep(link) == (columns_of(grid.range_steps), columns_of(grid.texture))
@@ -87,7 +87,7 @@ def test_it_serves_sweep_after_sweep_of_exactly_the_truth_it_wrote(tmp_path: Pat
 def test_jitter_moves_columns_off_their_nominal_angle(tmp_path: Path) -> None:
     link, truth = tmp_path / "scanner", tmp_path / "truth.npz"
     with simulated(link, *FAST, "--jitter", "12", "--truth", str(truth)):
-        _, grid = read_scan(truth)
+        _, grid, _ = read_scan(truth)
         ranges, textures = sweep(link)
     nominal = columns_of(grid.texture)
     assert np.mean([textures[column] != nominal[column] for column in nominal]) > 0.5
