@@ -70,7 +70,7 @@ def run_import(args: argparse.Namespace) -> int:
         line = f"{args.output}: {spec.geometry}, {spec.width} x {spec.height}"
     else:
         scan = asyncio.run(_import(args, found))
-        record, line = {"scan": scan}, f"scan {scan}: {spec.geometry}"
+        record, line = {"scan": scan}, f"scan {scan}"
     record |= {"geometry": spec.geometry, "note": found.note}
     print(json.dumps(record) if args.json else "\n".join(filter(None, (line, printable(found.note)))), flush=True)
     return 0

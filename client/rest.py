@@ -15,14 +15,16 @@ BODY_MAX_BYTES = 4 << 20
 TIMEOUT = aiohttp.ClientTimeout(total=30)
 
 
-async def ask(http: aiohttp.ClientSession, method: str, url: str, body: object = None) -> Any:
+async def ask(
+    http: aiohttp.ClientSession, method: str, url: str, body: object = None, timeout: aiohttp.ClientTimeout = TIMEOUT
+) -> Any:
     """The JSON a node answers with. body : to be sent as JSON.
 
     Raises RequestRefused, NodeLost, NodeNotTrusted, RemoteWireError.
     """
     data = None if body is None else msgspec.json.encode(body)
     try:
-        async with http.request(method, url, data=data, timeout=TIMEOUT) as response:
+        async with http.request(method, url, data=data, timeout=timeout) as response:
             return reply(response.status, await bounded_body(response))
     except (aiohttp.ClientError, OSError) as error:
         raise trouble(url, error) from error

@@ -59,6 +59,8 @@ def _is_scan(scan: dict[str, Any]) -> bool:
 
 def _line(scan: dict[str, Any]) -> str:
     shape = f"{scan['width']} x {scan['height']} + {scan['textureWidth']} x {scan['textureHeight']}"
+    if scan.get("geometry", "cylinder") != "cylinder":
+        shape += f" {printable(str(scan['geometry']))}"
     return f"{printable(scan['id'])}  {_made(scan['created'])}  {shape}  {printable(scan['name'])}".rstrip()
 
 

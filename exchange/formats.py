@@ -41,7 +41,7 @@ SIZES: Mapping[str, Size] = MappingProxyType(
 class ReadOptions:
     """What a file does not say itself.
 
-    size : W, H, Wt, Ht a mesh is cast on.  placing : of a mesh; None: as its format demands.  theta0_rad : see fit_spec.
+    size : W, H, Wt, Ht a mesh is cast on.  placing : of one; None: as its format demands.  theta0_rad : see fit_spec.
     geometry : as what it is wanted; None: a grid as it is, a mesh as a sphere if it is closed and hides little of
     itself from its centre, else as a cylinder.  caps : make up lids over a cylinder's open ends (exchange.closing).
     centre_mm : height of a sphere's centre; None: chosen.  Raises ExchangeError for what only a sphere has.
@@ -130,10 +130,11 @@ def as_wanted(
         return found
     if options.geometry == "cylinder":
         return found._replace(grid=unroll(found.grid), note=joined(found.note, "a sphere as its axis sees it"))
+    repaired = f"{len(found.grid.repairs)} samples of it were repaired" if found.grid.repairs.size else ""
     closed, said = close_scan(
         found.grid, caps=options.caps, centre_mm=options.centre_mm, progress=progress
     )
-    return found._replace(grid=closed, note=joined(found.note, str(said)))
+    return found._replace(grid=closed, note=joined(found.note, str(said), repaired))
 
 
 def joined(*notes: str) -> str:

@@ -39,9 +39,9 @@ REFUSALS, REFUSALS_S = 100, 10.0  # so many are written down within so long, the
 WHAT_MAX = 300
 
 Event = Literal[
-    "started", "stopped", "listed", "watched", "opened", "seen", "read", "exported", "imported", "scanned", "changed",
-    "verified", "deleted", "sweep asked", "sweep resumed", "sweep exported", "sweep deleted", "expired", "backed up",
-    "restored", "code offered", "paired", "revoked", "codes voided", "refused",
+    "started", "stopped", "listed", "watched", "opened", "seen", "read", "exported", "imported", "scanned", "derived",
+    "changed", "verified", "deleted", "sweep asked", "sweep resumed", "sweep exported", "sweep deleted", "expired",
+    "backed up", "restored", "code offered", "paired", "revoked", "codes voided", "refused",
 ]  # fmt: skip
 
 

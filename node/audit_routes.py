@@ -32,6 +32,7 @@ AUDITED: dict[tuple[str, str], Event] = {
     ("GET", "/v1/scans/{scan}/coarse"): "seen",
     ("GET", "/v1/scans/{scan}/fovea/{epoch}/{range}/{texture}"): "seen",
     ("GET", "/v1/scans/{scan}.{format}"): "exported",
+    ("POST", "/v1/scans/{scan}/derive"): "derived",
     ("GET", "/v1/scans/{scan}/sidecar"): "read",
     ("PATCH", "/v1/scans/{scan}/sidecar"): "changed",
     ("POST", "/v1/scans/{scan}/verify"): "verified",

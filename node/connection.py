@@ -232,7 +232,8 @@ class Connection:
 
     async def _open(self, wanted: m.Open) -> None:
         try:
-            scan, view = await self._exhibits.open(wanted.scan, self._codecs[0], wanted.profile)
+            scan_id = self._exhibits.library.resolve(wanted.scan, self._geometries)
+            scan, view = await self._exhibits.open(scan_id, self._codecs[0], wanted.profile)
             if scan.spec.geometry not in self._geometries:
                 raise LibraryError(f"scan {scan.id} is a {scan.spec.geometry}, which this client cannot show")
             self._epoch = (self._epoch + 1) & 0xFFFF

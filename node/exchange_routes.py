@@ -18,14 +18,13 @@ from aiohttp import ClientError, web
 
 from exchange.errors import ExchangeError
 from exchange.formats import MEDIA_TYPES, writer_of
-from exchange.native import read_native
+from exchange.native import Scanned, read_native, write_native
 from node.audit_routes import SCAN
 from node.auth import require
 from node.exhibits import Exhibits
 from node.library import About, Scan
 from node.spool import CHUNK_BYTES, STALL_S, disk_trouble, send, spool
 from protocol.errors import LibraryError
-from protocol.grid import Grid
 
 IMPORT_BYTES_MAX = 1 << 29
 ARRAY_BYTES_MAX = 1 << 28
@@ -66,16 +65,16 @@ class ExchangeRoutes:
         async with self._importing:
             with spool(self._exhibits.library.folder) as file:
                 await _receive(request, file)
-                name, grid = await asyncio.to_thread(_read, file)
-            scan = await self._keep(name, grid)
+                found = await asyncio.to_thread(_read, file)
+            scan = await self._keep(found)
         request[SCAN] = scan.id
         self._published(scan.id)
         return web.Response(body=msgspec.json.encode({"id": scan.id}), content_type="application/json", status=201)
 
-    async def _keep(self, name: str, grid: Grid) -> Scan:
-        about = About(time.time(), "import", name)
+    async def _keep(self, found: Scanned) -> Scan:
+        about = About(time.time(), "import", found.name, note=found.note)
         try:
-            return await asyncio.to_thread(self._exhibits.library.add, grid, about)
+            return await asyncio.to_thread(self._exhibits.library.add, found.grid, about)
         except LibraryError as problem:
             raise web.HTTPInsufficientStorage(text=str(problem)) from problem
 
@@ -87,7 +86,10 @@ def _check_free(places: asyncio.Semaphore) -> None:
 
 def _write(scan: Scan, suffix: str, file: BinaryIO) -> None:
     try:
-        writer_of(suffix)(scan.grid, file)
+        if suffix == ".npz":
+            write_native(scan.grid, file, note=scan.about.note)
+        else:
+            writer_of(suffix)(scan.grid, file)
         file.flush()
     except ExchangeError as problem:
         raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
@@ -121,7 +123,7 @@ def _check_length(size_bytes: int) -> None:
         raise web.HTTPRequestEntityTooLarge(IMPORT_BYTES_MAX, size_bytes, text=f"at most {IMPORT_BYTES_MAX} bytes")
 
 
-def _read(file: BinaryIO) -> tuple[str, Grid]:
+def _read(file: BinaryIO) -> Scanned:
     file.seek(0)
     try:
         return read_native(file, array_bytes_max=ARRAY_BYTES_MAX)

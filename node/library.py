@@ -15,7 +15,7 @@ import shutil
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ from node.scan_folder import (
 from node.sidecar import FILE as SIDECAR_FILE
 from node.sidecar import Changes, Sidecar, change_sidecar, read_sidecar
 from protocol.errors import LibraryError
-from protocol.grid import Grid, GridSpec, ImageArray, RepairArray, StepArray
+from protocol.grid import GEOMETRIES, Geometry, Grid, GridSpec, ImageArray, RepairArray, StepArray
 
 __all__ = ["About", "Library", "Problem", "Scan", "ScanSummary", "content_id", "survey", "verify"]
 
@@ -138,22 +138,22 @@ class Library:
             raise LibraryError(f"no scan {scan_id[:40]!r} in this library")
         return summary
 
-    def resolve(self, scan_id: str) -> str:
+    def resolve(self, scan_id: str, geometries: Sequence[Geometry] = GEOMETRIES) -> str:
         """The id that "latest" stands for, or the beginning of just one id; any other is returned as it is.
 
-        Raises LibraryError when there is no scan, or several begin so.
+        geometries : those that "latest" may have.  Raises LibraryError when there is no scan, or several begin so.
         """
         if scan_id == LATEST:
-            scans = self.scans()
-            if not scans:
+            found = next((scan for scan in self.scans() if scan.spec.geometry in geometries), None)
+            if found is None:
                 raise LibraryError("there is no scan yet: start a sweep")
-            return scans[0].id
+            return found.id
         if scan_id in self._known or len(scan_id) < PREFIX_MIN:
             return scan_id
-        found = [known for known in self._known if known.startswith(scan_id)]
-        if len(found) > 1:
-            raise LibraryError(f"{len(found)} scans begin with {scan_id!r}: give more of the id")
-        return found[0] if found else scan_id
+        begin_so = [known for known in self._known if known.startswith(scan_id)]
+        if len(begin_so) > 1:
+            raise LibraryError(f"{len(begin_so)} scans begin with {scan_id!r}: give more of the id")
+        return begin_so[0] if begin_so else scan_id
 
     def open(self, scan_id: str) -> Scan:
         """A scan with its samples mapped and checked against its id. Raises LibraryError when unknown or damaged."""

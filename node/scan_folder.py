@@ -25,6 +25,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from exchange.native import NOTE_MAX
 from node.durable import read_bounded, sync_folder, write_whole
 from node.scan_quality import ScanQuality
 from protocol.errors import LibraryError
@@ -35,6 +36,7 @@ RECORD_BYTES_MAX = 65536
 ARRAY_HEADER_BYTES_MAX = 4096
 TEXT_MAX = 200
 NAMED_MAX = 3
+MADE_FROM_MAX = 8
 SCAN_ID = re.compile("[0-9a-f]{32}")
 INCOMING = ".incoming-"
 RANGE_FILE, TEXTURE_FILE, REPAIRS_FILE, RECORD_FILE = "range.npy", "texture.npy", "repairs.npy", "scan.json"
@@ -45,20 +47,26 @@ REPAIR_BYTES = 12
 class About:
     """Where a scan came from. Nothing of the patient: this is listed freely.
 
-    created_unix_s : the node's clock, for people; it orders nothing.  source : "sweep", "import", ...
+    created_unix_s : the node's clock, for people; it orders nothing.  source : "sweep", "import" or "derived".
     name : what to call it, at most 200 characters.  quality : what the sweep was worth, None of a scan that came as a
-    file, or from a version that did not keep it.  Raises ValueError when out of bounds.
+    file, or from a version that did not keep it.  note : how it was made where it was not measured so, and what of it
+    is made up; at most 1000 characters.  made_from : the ids of the scans it was made of.
+    Raises ValueError when out of bounds.
     """
 
     created_unix_s: float
     source: str = "sweep"
     name: str = ""
     quality: ScanQuality | None = None
+    note: str = ""
+    made_from: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.created_unix_s):
             raise ValueError(f"created_unix_s must be finite, got {self.created_unix_s}")
-        for text in (self.source, self.name):
+        if len(self.note) > NOTE_MAX or len(self.made_from) > MADE_FROM_MAX:
+            raise ValueError(f"a note of {len(self.note)} characters, or {len(self.made_from)} scans it was made of")
+        for text in (self.source, self.name, *self.made_from):
             if len(text) > TEXT_MAX:
                 raise ValueError(f"a text of {len(text)} characters, at most {TEXT_MAX} are kept")
 

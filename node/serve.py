@@ -20,6 +20,7 @@ from node.auth import CHALLENGE, LOGIN, Auth, Refusal, require
 from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection
+from node.derive import Derivation
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
@@ -91,6 +92,7 @@ class NodeServer:
         self._app.on_response_prepare.extend((_harden, audit_routes.witness))
         self._app.on_cleanup.append(self._close_audit)
         pairing = PairingRoutes(access, tls, self.audit, self._refused, info.id, info.name, self._expel)
+        self.derivation = Derivation(exhibits, self.publish, self.audit)
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
         self._app.add_routes([
             *Page().routes(),
@@ -103,6 +105,7 @@ class NodeServer:
             web.get("/v1/stream", self._stream),
             *self._shared.routes(),
             *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
+            *self.derivation.routes(),
             *pairing.routes(),
             *audit_routes.routes(),
         ])  # fmt: skip
@@ -128,6 +131,8 @@ class NodeServer:
             await asyncio.wait(goodbyes, timeout=GOODBYE_S)
         for line in self._connections.values():
             line.abort()
+        await self.derivation.stop()
+        await self.derivation.stop()
         self.audit.note("stopped", NODE)
         await self._runner.cleanup()
 
@@ -168,9 +173,11 @@ class NodeServer:
         await asyncio.to_thread(self.audit.close)
 
     def swept(self, scan_id: str) -> None:
-        """A sweep has become a scan: note it, and tell every client."""
+        """A sweep has become a scan: note it, tell every client, and see whether it is to be a sphere, too."""
         self.audit.note("scanned", NODE, scan=scan_id)
         self.publish(scan_id)
+        if self._config.library.spheres:
+            self.derivation.consider(scan_id)
 
     def use(self, config: Config) -> None:
         """Go on with other settings, of those that `node.reload` lets change. Raises AccessError, and changes none."""
@@ -224,7 +231,8 @@ class NodeServer:
         request[SCAN] = scan.id
         quality = scan.about.quality
         said = quality and m.ScanQuality(**asdict(quality), complaints=quality.complaints)
-        return _json({**msgspec.to_builtins(scan_info(scan)), "quality": said})
+        made = {"note": scan.about.note, "madeFrom": scan.about.made_from}
+        return _json({**msgspec.to_builtins(scan_info(scan)), "quality": said, **made})
 
     async def _coarse(self, request: web.Request) -> web.Response:
         """The first view as its two refinements, one behind the other, each behind its length (u32, little-endian)."""
@@ -276,6 +284,7 @@ def _summary(scan: ScanSummary) -> dict[str, object]:
     return {
         "id": scan.id, "created": scan.about.created_unix_s, "source": scan.about.source, "name": scan.about.name,
         "width": s.width, "height": s.height, "textureWidth": s.texture_width, "textureHeight": s.texture_height,
+        "geometry": s.geometry, "madeFrom": scan.about.made_from,
     }  # fmt: skip
 
 

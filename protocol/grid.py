@@ -24,6 +24,7 @@ RANGE_BLOCK = 8
 TEXTURE_BLOCK = 16
 
 Geometry = Literal["cylinder", "sphere"]
+GEOMETRIES: tuple[Geometry, ...] = ("cylinder", "sphere")
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 StepArray = NDArray[np.uint16]

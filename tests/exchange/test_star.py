@@ -107,7 +107,7 @@ def test_an_open_object_is_refused() -> None:
 
 def test_an_object_that_is_not_star_shaped_is_refused_with_what_it_hides() -> None:
     dumbbell = joined(ball(20, (0, 0, 40)), untyped.creation.cylinder(5, 80), ball(20, (0, 0, -40)))
-    with pytest.raises(ExchangeError, match=r"\d+\.\d% of its surface is hidden.*mesh"):
+    with pytest.raises(ExchangeError, match=r"\d+\.\d% of its surface is hidden.*--geometry cylinder"):
         close_mesh(grey(dumbbell), SIZE)
 
 
@@ -157,11 +157,50 @@ def test_a_mesh_of_a_sphere_is_cast_back_to_it_within_a_step() -> None:
     np.testing.assert_allclose(back.range_mm, grid.range_mm, atol=0.02)
 
 
-def test_a_closed_mesh_file_becomes_a_sphere_on_demand(tmp_path: Path) -> None:
-    ball().export(tmp_path / "ball.ply")
-    _, grid, _ = read_scan(tmp_path / "ball.ply", options=ReadOptions(SIZE, geometry="sphere"))
-    assert grid.spec.geometry == "sphere"
-    assert read_scan(tmp_path / "ball.ply", options=ReadOptions(SIZE))[1].spec.geometry == "cylinder"
+def test_a_mesh_is_a_sphere_if_it_is_closed_and_seen_whole_or_wanted_so(tmp_path: Path) -> None:
+    dumbbell = joined(ball(20, (0, 0, 40)), untyped.creation.cylinder(5, 80), ball(20, (0, 0, -40)))
+    whole = ball()
+    bowl = trimesh.Trimesh(whole.vertices, whole.faces[whole.triangles_center[:, 2] < 25], process=False)
+    solids = ("ball", whole, "sphere"), ("bell", dumbbell, "cylinder"), ("bowl", bowl, "cylinder")
+    for name, solid, expected in solids:
+        solid.export(tmp_path / f"{name}.ply")
+        found = read_scan(tmp_path / f"{name}.ply", options=ReadOptions(SIZE))
+        assert found.grid.spec.geometry == expected, name
+        assert ("closed mesh" in found.note) is (expected == "sphere")
+        level = read_scan(tmp_path / f"{name}.ply", options=ReadOptions(SIZE, geometry="cylinder"))
+        assert level.grid.spec.geometry == "cylinder"
+    with pytest.raises(ExchangeError, match=r"bowl\.ply: mesh: .* not closed.*--geometry cylinder"):
+        read_scan(tmp_path / "bowl.ply", options=ReadOptions(SIZE, geometry="sphere"))
+    with pytest.raises(ExchangeError, match="not inside"):
+        read_scan(tmp_path / "ball.ply", options=ReadOptions(SIZE, geometry="sphere", centre_mm=70))
+
+
+def test_points_are_no_sphere(tmp_path: Path) -> None:
+    untyped.PointCloud(ball().vertices).export(tmp_path / "points.ply")
+    with pytest.raises(ExchangeError, match="points are not closed"):
+        read_scan(tmp_path / "points.ply", options=ReadOptions(SIZE, geometry="sphere"))
+
+
+def test_a_grid_keeps_its_geometry_unless_another_is_wanted(tmp_path: Path) -> None:
+    with open(tmp_path / "potato.npz", "wb") as file:
+        write_native(potato(), file, "potato", "grown")
+    path = tmp_path / "potato.npz"
+    assert read_scan(path).grid.spec == potato().spec and read_scan(path).note == "grown"
+    level = read_scan(path, options=ReadOptions(geometry="cylinder"))
+    assert level.grid.spec.geometry == "cylinder" and level.note.startswith("grown. ")
+    with open(tmp_path / "level.npz", "wb") as file:
+        write_native(level.grid, file)
+    closed = read_scan(tmp_path / "level.npz", options=ReadOptions(geometry="sphere", caps=True))
+    assert closed.grid.spec.geometry == "sphere" and "a cylinder seen from a centre" in closed.note
+    with pytest.raises(ExchangeError, match="--geometry sphere"):
+        ReadOptions(geometry="cylinder", caps=True)
+
+
+def test_a_vertex_at_the_centre_has_no_direction_and_does_no_harm() -> None:
+    spoke = trimesh.Trimesh([[0, 0, 0], [20, 0, 0], [20, 3, 0]], [[0, 1, 2]], process=False)
+    grid, seen = close_mesh(grey(joined(ball(), spoke)), SIZE, centre_mm=0.0)
+    assert grid.range_steps.min() * grid.spec.step_mm > 49.5
+    assert 0 < seen.hidden < 0.01
 
 
 def test_a_spherical_grid_file_comes_back_and_must_be_thinned() -> None:

@@ -82,7 +82,10 @@ def test_a_mesh_goes_in_and_comes_out(tmp_path: Path, capsys: pytest.CaptureFixt
     with node(tmp_path / "library") as (url, library):
         assert run("import", str(ball), "--size", "72x40:128x64", "--node", url, "--json") == 0
         (scan,) = library.scans()
-        assert json.loads(capsys.readouterr().out) == {"scan": scan.id} and scan.about.name == "ball"
+        note = "a closed mesh seen from a centre at 0.0 mm"
+        said = {"scan": scan.id, "geometry": "sphere", "note": note}
+        assert json.loads(capsys.readouterr().out) == said
+        assert (scan.about.name, scan.about.note) == ("ball", note)
         assert run("export", str(tmp_path / "out.stl"), "--node", url, "--scan", scan.id, "--json") == 0
         said = json.loads(capsys.readouterr().out)
     assert said["bytes"] == (tmp_path / "out.stl").stat().st_size

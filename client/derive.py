@@ -1,0 +1,45 @@
+"""Having a node make scans of scans."""
+
+from __future__ import annotations
+
+import aiohttp
+import msgspec
+
+from client.discovery import NodeAddress
+from client.login import logged_in
+from client.rest import ask
+from protocol.errors import RemoteWireError
+from protocol.grid import Geometry
+
+TIMEOUT = aiohttp.ClientTimeout(total=600)
+
+
+class Derived(msgspec.Struct, frozen=True):
+    """A scan that was made of another. scan : its id.  note : how it was made, and what of it is made up."""
+
+    scan: str = msgspec.field(name="id")
+    geometry: Geometry
+    note: str = ""
+
+
+async def derive_scan(
+    node: NodeAddress | str,
+    scan: str,
+    geometry: Geometry,
+    *,
+    caps: bool = False,
+    centre_height_mm: float | None = None,
+    token: str | None = None,
+) -> Derived:
+    """Have a node keep a scan ("latest" or an id) in another geometry, as a scan of its own.
+
+    caps : make up lids over a cylinder's open ends.  centre_height_mm : of a sphere's centre; None: chosen.
+    Raises what `connect` raises: RequestRefused, with the reason, for a scan that cannot be made so.
+    """
+    wanted = {"geometry": geometry, "caps": caps, "centreHeightMm": centre_height_mm}
+    async with logged_in(node, token) as (url, http):
+        said = await ask(http, "POST", f"{url}/v1/scans/{scan}/derive", wanted, TIMEOUT)
+    try:
+        return msgspec.convert(said, Derived)
+    except msgspec.ValidationError as problem:
+        raise RemoteWireError(f"the node made a scan and does not say which: {problem}") from None

@@ -1,0 +1,141 @@
+"""Scans made of scans: a cylinder as a sphere, or a sphere as a cylinder, each kept as a scan of its own.
+
+A scan never changes, so what is made of it stands beside it, and says of which scans it was made and how. That happens
+when somebody asks, over HTTP, and by itself when both ends of a sweep are round: then its object is closed, and a
+client sees all of its sides, poles included.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Annotated
+
+import msgspec
+from aiohttp import web
+from msgspec import Meta, Struct
+
+from exchange.closing import closes
+from exchange.errors import ExchangeError
+from exchange.formats import ReadOptions, as_wanted
+from exchange.native import Scanned
+from node.audit import NODE, Audit
+from node.audit_routes import SCAN, WHAT
+from node.auth import require
+from node.exhibits import Exhibits
+from node.library import About, Library, Scan
+from protocol.errors import LibraryError
+from protocol.grid import Geometry
+
+log = logging.getLogger(__name__)
+
+AT_ONCE = 1
+
+
+class Wanted(Struct, frozen=True, forbid_unknown_fields=True, rename="camel"):
+    """What a scan is to become. caps, centre_height_mm : of a sphere, as exchange.formats.ReadOptions has them."""
+
+    geometry: Geometry
+    caps: bool = False
+    centre_height_mm: Annotated[float, Meta(ge=-1e6, le=1e6)] | None = None
+
+    def options(self) -> ReadOptions:
+        """The same as the exchange knows it. Raises ExchangeError for what does not go together."""
+        return ReadOptions(geometry=self.geometry, caps=self.caps, centre_mm=self.centre_height_mm)
+
+
+class Stopping(Exception):
+    """The node ends, and with it what it was working on."""
+
+
+def derive(library: Library, scan_id: str, wanted: Wanted, progress: Callable[[float], object]) -> Scan:
+    """Make a scan of a scan, safe on disk before this returns. progress : told the share done; may raise.
+
+    Raises LibraryError for one that is unknown or cannot be kept, ExchangeError for one that cannot be made so.
+    """
+    options = wanted.options()
+    source = library.open(scan_id)
+    if wanted.geometry == source.spec.geometry:
+        raise ExchangeError(f"scan: is a {wanted.geometry} already")
+    found = Scanned(source.about.name, source.grid, source.about.note)
+    made = as_wanted(found, options, progress)
+    return library.add(made.grid, About(time.time(), "derived", made.name, note=made.note, made_from=(scan_id,)))
+
+
+class Derivation:
+    """Derives one scan at a time; everything here runs in one event loop.
+
+    published : told the id of each.  audit : where those are noted that nobody asked for.
+    """
+
+    def __init__(self, exhibits: Exhibits, published: Callable[[str], object], audit: Audit) -> None:
+        self._exhibits = exhibits
+        self._audit = audit
+        self._published = published
+        self._place = asyncio.Semaphore(AT_ONCE)
+        self._stopping = threading.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def routes(self) -> list[web.RouteDef]:
+        """What to add to the application."""
+        return [web.post("/v1/scans/{scan}/derive", self._derive)]
+
+    def consider(self, scan_id: str) -> None:
+        """Make a sphere of a new sweep, if its ends are round; later, beside everything else."""
+        task = asyncio.create_task(self._close(scan_id))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def stop(self) -> None:
+        """Leave what is not finished."""
+        self._stopping.set()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _close(self, scan_id: str) -> None:
+        library = self._exhibits.library
+        async with self._place:
+            try:
+                if await asyncio.to_thread(lambda: closes(library.open(scan_id).grid)):
+                    scan = await self._made(scan_id, Wanted("sphere"))
+                    self._audit.note("derived", NODE, scan=scan.id, what=f"of {scan_id}")
+                    log.info("scan published, too: %s", scan.about.note)
+            except (ExchangeError, LibraryError) as problem:
+                log.warning("the scan is not kept as a sphere: %s", problem)
+            except Stopping:
+                pass
+
+    async def _derive(self, request: web.Request) -> web.Response:
+        require(request, "operate")
+        wanted = _decoded(await request.read())
+        if self._place.locked():
+            raise web.HTTPServiceUnavailable(text="busy with another scan: try again later")
+        async with self._place:
+            source = self._exhibits.library.resolve(request.match_info["scan"])
+            try:
+                scan = await self._made(source, wanted)
+            except ExchangeError as problem:
+                raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
+            except Stopping:
+                raise web.HTTPServiceUnavailable(text="the node is stopping") from None
+        request[SCAN], request[WHAT] = scan.id, f"of {source}"
+        said = {"id": scan.id, "geometry": scan.spec.geometry, "note": scan.about.note}
+        return web.Response(body=msgspec.json.encode(said), content_type="application/json", status=201)
+
+    async def _made(self, scan_id: str, wanted: Wanted) -> Scan:
+        scan = await asyncio.to_thread(derive, self._exhibits.library, scan_id, wanted, self._go_on)
+        self._published(scan.id)
+        return scan
+
+    def _go_on(self, share: float) -> None:
+        if self._stopping.is_set():
+            raise Stopping
+
+
+def _decoded(body: bytes) -> Wanted:
+    try:
+        return msgspec.json.decode(body, type=Wanted)
+    except (msgspec.DecodeError, UnicodeDecodeError) as problem:
+        raise web.HTTPBadRequest(text=f"derive: {problem}") from problem

@@ -1,0 +1,144 @@
+"""Scans made of scans: what a node makes of its own, when asked and by itself, and what it says of that."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from exchange.closing import close_scan, closes
+from exchange.native import read_native
+from node import derive
+from node.library import About, Library, content_id
+from node.serve import NodeServer
+from protocol.grid import Grid
+from simulators.nutcracker import nutcracker
+from simulators.shapes import cylinder, sphere
+from tests.node.served import Client, served
+
+SHAPE = (96, 80, 96, 64)
+BALL, CAN = sphere(SHAPE, 0), cylinder(SHAPE, 0)
+
+
+@asynccontextmanager
+async def node(folder: Path, *grids: Grid) -> AsyncIterator[tuple[Client, NodeServer, Library, list[str]]]:
+    """Whom to ask, and the ids of the scans it begins with."""
+    library = Library(folder / "library")
+    ids = [library.add(grid, About(1e9, name="thing")).id for grid in grids]
+    async with served(library) as (client, server):
+        yield client, server, library, ids
+        await server.derivation.stop()
+
+
+async def derived(client: Client, scan: str, **wanted: Any) -> dict[str, Any]:
+    answer = await client.post(f"/v1/scans/{scan}/derive", json=wanted)
+    assert answer.status == 201, await answer.text()
+    said: dict[str, Any] = await answer.json()
+    return said
+
+
+async def test_a_sphere_is_a_scan_of_its_own_that_says_where_it_comes_from(tmp_path: Path) -> None:
+    async with node(tmp_path, BALL) as (client, _, library, [ball]):
+        said = await derived(client, ball, geometry="sphere")
+        assert said["id"] == content_id(close_scan(BALL)[0])
+        about = await (await client.get(f"/v1/scans/{said['id']}")).json()
+        assert (about["geometry"], about["madeFrom"], about["note"]) == ("sphere", [ball], said["note"])
+        listed = {scan["id"]: scan for scan in await (await client.get("/v1/scans")).json()}
+        assert [listed[scan]["geometry"] for scan in (ball, said["id"])] == ["cylinder", "sphere"]
+        assert (listed[said["id"]]["source"], listed[said["id"]]["name"]) == ("derived", "thing")
+        assert library.open(ball).about.made_from == ()
+
+
+async def test_what_is_made_up_is_said_and_stays_said(tmp_path: Path) -> None:
+    async with node(tmp_path, CAN) as (client, _, _, [can]):
+        said = await derived(client, can, geometry="sphere", caps=True)
+        assert "made up" in said["note"]
+        file = await (await client.get(f"/v1/scans/{said['id']}.npz")).read()
+        (tmp_path / "can.npz").write_bytes(file)
+        with open(tmp_path / "can.npz", "rb") as exported:
+            assert read_native(exported).note == said["note"]
+    async with node(tmp_path / "other") as (client, _, library, _):
+        brought = await (await client.post("/v1/scans", data=file)).json()
+        assert brought["id"] == said["id"]
+        assert library.open(brought["id"]).about.note == said["note"]
+
+
+async def test_a_sphere_becomes_a_cylinder_on_demand(tmp_path: Path) -> None:
+    async with node(tmp_path, BALL) as (client, _, library, [ball]):
+        closed = await derived(client, ball, geometry="sphere")
+        back = await derived(client, closed["id"], geometry="cylinder")
+        assert back["geometry"] == "cylinder"
+        assert library.open(back["id"]).about.made_from == (closed["id"],)
+        assert "axis" in back["note"] and closed["note"] in back["note"]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "status", "message"),
+    [
+        ({"geometry": "cylinder"}, 422, "cylinder already"),
+        ({"geometry": "sphere", "centreHeightMm": 500}, 422, "not inside"),
+        ({"geometry": "cylinder", "caps": True}, 422, "go with a sphere"),
+        ({"geometry": "cone"}, 400, "geometry"),
+        ({"geometry": "sphere", "lids": True}, 400, "lids"),
+        ({}, 400, "geometry"),
+        ({"geometry": "sphere", "centreHeightMm": 1e9}, 400, "centreHeightMm"),
+    ],
+)
+async def test_what_cannot_be_made_is_refused(
+    tmp_path: Path, wanted: dict[str, Any], status: int, message: str
+) -> None:
+    async with node(tmp_path, CAN) as (client, _, library, [can]):
+        answer = await client.post(f"/v1/scans/{can}/derive", json=wanted)
+        assert answer.status == status and message in await answer.text()
+        assert len(library.scans()) == 1
+        assert (await client.post("/v1/scans/0/derive", json={"geometry": "sphere"})).status == 404
+        assert (await client.post(f"/v1/scans/{can}/derive", data=b"\xff")).status == 400
+
+
+async def test_what_hides_much_of_itself_is_refused_with_a_cure(tmp_path: Path) -> None:
+    async with node(tmp_path, nutcracker(SHAPE, 0)) as (client, _, _, [doll]):
+        answer = await client.post(f"/v1/scans/{doll}/derive", json={"geometry": "sphere"})
+        assert answer.status == 422 and "keep it as a cylinder" in await answer.text()
+
+
+async def test_a_sweep_with_round_ends_is_kept_as_a_sphere_too(tmp_path: Path) -> None:
+    async with node(tmp_path, BALL, CAN) as (_, server, library, ids):
+        for scan in ids:
+            server.swept(scan)
+        await asyncio.gather(*server.derivation._tasks)
+        made = [scan for scan in library.scans() if scan.about.made_from]
+        assert [scan.about.made_from for scan in made] == [(ids[0],)]
+        assert made[0].spec.geometry == "sphere"
+        assert library.resolve("latest") == made[0].id
+        assert library.resolve("latest", ("cylinder",)) == ids[1]
+
+
+async def test_a_node_that_stops_leaves_what_it_was_deriving(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with node(tmp_path, BALL) as (_, server, library, [ball]):
+
+        def closes_at_the_end(grid: Grid) -> bool:
+            server.derivation._stopping.set()
+            return closes(grid)
+
+        monkeypatch.setattr(derive, "closes", closes_at_the_end)
+        server.swept(ball)
+        await asyncio.gather(*server.derivation._tasks)
+        assert len(library.scans()) == 1
+
+
+async def test_only_one_is_made_at_a_time(tmp_path: Path) -> None:
+    async with node(tmp_path, BALL) as (client, server, _, [ball]):
+        async with server.derivation._place:
+            answer = await client.post(f"/v1/scans/{ball}/derive", json={"geometry": "sphere"})
+        assert answer.status == 503 and "busy" in await answer.text()
+
+
+def test_a_scan_of_nothing_but_voids_does_not_close() -> None:
+    assert not closes(Grid(BALL.spec, np.zeros_like(BALL.range_steps), BALL.texture))

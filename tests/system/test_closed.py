@@ -1,0 +1,64 @@
+"""Closed objects through the commands and a real node: swept, brought, derived, and looked at over a pole."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from exchange.formats import read_scan
+from exchange.native import write_native
+from foveascan import main, started
+from simulators.shapes import cylinder
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> Iterator[str]:
+    serve = ["serve", "--library", str(tmp_path / "library"), "--listen", "127.0.0.1:0", "--insecure", "--json"]
+    with started(*serve) as (_, ready):
+        yield ready["url"]
+
+
+def told(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, str]:
+    assert main([*command, "--json"]) == 0
+    said: dict[str, str] = json.loads(capsys.readouterr().out.splitlines()[-1])
+    return said
+
+
+def test_a_cylinder_is_closed_here_as_on_the_node(tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with open(tmp_path / "can.npz", "wb") as file:
+        write_native(cylinder((48, 40, 96, 64), 0), file, "can")
+    at_node = ("--node", url)
+    scan = told(capsys, "import", str(tmp_path / "can.npz"), *at_node)["scan"]
+    to_sphere = ("--geometry", "sphere", "--caps", *at_node)
+    here = told(capsys, "import", str(tmp_path / "can.npz"), *to_sphere)
+    there = told(capsys, "derive", "--scan", scan[:8], *to_sphere)
+    assert here == there and here["geometry"] == "sphere" and "made up" in here["note"]
+
+    assert main(["derive", "--scan", there["scan"], "--geometry", "cylinder", *at_node]) == 0
+    assert "a sphere as its axis sees it" in capsys.readouterr().out
+    assert main(["scans", *at_node]) == 0
+    assert " sphere  can\n" in capsys.readouterr().out
+    told(capsys, "export", str(tmp_path / "closed.npz"), "--scan", there["scan"], *at_node)
+    assert read_scan(tmp_path / "closed.npz").note == there["note"]
+
+
+@pytest.mark.parametrize(
+    ("command", "cure"),
+    [
+        (("derive", "--centre-height", "900"), "not inside"),
+        (("derive", "--geometry", "cylinder"), "cylinder already"),
+        (("derive", "--geometry", "cylinder", "--caps"), "--geometry sphere"),
+        (("derive", "--scan", "123456"), "no scan"),
+    ],
+)
+def test_what_cannot_be_made_is_told_with_its_cure(
+    tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str], command: tuple[str, ...], cure: str
+) -> None:
+    with open(tmp_path / "can.npz", "wb") as file:
+        write_native(cylinder((48, 40, 96, 64), 0), file)
+    assert main(["import", str(tmp_path / "can.npz"), "--node", url]) == 0
+    assert main([*command, "--node", url]) == 1
+    assert cure in capsys.readouterr().err
