@@ -17,11 +17,10 @@ from client.errors import HoldingsDiffer
 from client.export import write_grid
 from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, decode_texture
 from protocol.errors import CodecError, LatticeError, RemoteWireError
-from protocol.grid import VOID, BoolArray, FloatArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
+from protocol.grid import VOID, FloatArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
 from protocol.holdings import ChannelHoldings, Holdings, range_rank, texture_rank
-from protocol.lattice import Channel, Parameters, build_lattice
+from protocol.lattice import Channel, Parameters
 from protocol.messages import ScanInfo, Statement
-from protocol.range_payload import decode_selection
 from protocol.reconstruct import (
     Selection,
     coarse_to_range,
@@ -29,11 +28,11 @@ from protocol.reconstruct import (
     content_hashes,
     paste,
     range_patch,
-    select,
     texture_patch,
 )
 from protocol.refinement import Generator, Refinement
 from protocol.sphere import default_mesh, ranges_on, vectors
+from protocol.strips import Strip, Strips, blocks_of, build_strips, samples_of, select_strips, split_parts
 
 Codec = TypeVar("Codec", RangeCodec, TextureCodec)
 Array = TypeVar("Array", NDArray[np.float32], StepArray, ImageArray)
@@ -166,39 +165,39 @@ class Model:
         _rank(refinement)
         if refinement.channel is Channel.RANGE:
             coarse = _decode_range(refinement, coarse_shape)
-            _apply_mask(refinement, coarse)
+            _apply_mask(refinement.mask, coarse)
             self._steps = coarse_to_range(coarse, shape)
             self._range_mm = None
         else:
             self._texels = coarse_to_texture(texture_of(refinement, coarse_shape), shape)
 
     def _apply_fovea(self, refinement: Refinement) -> IntArray:
-        selection, adopted = self._select(refinement)
-        blocks = selection.adopted_blocks()
+        strips = self._select(refinement)
         if refinement.channel is Channel.RANGE:
-            steps = range_patch(selection, _decode_selection(refinement, selection))
-            _apply_mask(refinement, steps)
-            paste(self._steps, steps, selection)
-            self.holdings.add_content(blocks, content_hashes(steps, selection))
+            for selection, steps in zip(_selections(strips), _range_patches(refinement, strips), strict=True):
+                paste(self._steps, steps, selection)
+                self.holdings.add_content(selection.adopted_blocks(), content_hashes(steps, selection))
             self._range_mm = self._spacing = None
         else:
-            texels = texture_of(refinement, selection.sample_shape)
-            paste(self._texels, texture_patch(selection, texels), selection)
-        self.holdings.channels[refinement.channel].adopt(selection.lattice, adopted, _rank(refinement))
-        return blocks
+            for selection, texels in zip(_selections(strips), _texture_patches(refinement, strips), strict=True):
+                paste(self._texels, texels, selection)
+        for strip in strips:
+            held = self.holdings.channels[refinement.channel]
+            held.adopt(strip.selection.lattice, strip.adopted, _rank(refinement))
+        return np.sort(blocks_of(strips))
 
-    def _select(self, refinement: Refinement) -> tuple[Selection, BoolArray]:
+    def _select(self, refinement: Refinement) -> Strips:
         """Which samples arrived and which blocks they may change, from the parameters and holdings the node had too."""
         if not isinstance(refinement.parameters, Parameters):
             raise RemoteWireError(f"{name_of(refinement)}: of another profile than the scan was opened with")
         shape = self.shapes[refinement.channel]
         held, rank = self.holdings.channels[refinement.channel], _rank(refinement)
         planned_over = ChannelHoldings.coarse(shape) if refinement.self_contained else held
-        chosen = select(build_lattice(shape, refinement.parameters), planned_over, rank)
-        expected = chosen[0].samples if chosen else 0
-        if chosen is None or expected != refinement.samples:
+        strips = select_strips(build_strips(shape, refinement.parameters), planned_over, rank)
+        expected = samples_of(strips)
+        if not strips or expected != refinement.samples:
             raise HoldingsDiffer(f"{name_of(refinement)}: {refinement.samples} samples, {expected} expected")
-        return _only_finer(*chosen, held, rank) if refinement.self_contained else chosen
+        return tuple(_only_finer(strip, held, rank) for strip in strips) if refinement.self_contained else strips
 
 
 def spacing_of_levels(held: ChannelHoldings) -> NDArray[np.float32]:
@@ -213,22 +212,38 @@ def _decode_range(refinement: Refinement, shape: tuple[int, int]) -> StepArray:
     return decode_range(refinement.payload, _codec(RangeCodec, refinement.codec), shape, refinement.quality)
 
 
-def _decode_selection(refinement: Refinement, selection: Selection) -> StepArray:
-    """The same of a fovea."""
-    return decode_selection(selection, refinement.payload, _codec(RangeCodec, refinement.codec), refinement.quality)
+def _selections(strips: Strips) -> list[Selection]:
+    return [strip.selection for strip in strips]
 
 
-def texture_of(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:
-    """Transmitted texels, shape + (3,). Raises CodecError, RemoteWireError."""
+def _range_patches(refinement: Refinement, strips: Strips) -> list[StepArray]:
+    """What goes into each strip, voids included. Raises CodecError."""
+    codec, patches = _codec(RangeCodec, refinement.codec), []
+    payloads, masks = (split_parts(data, len(strips)) for data in (refinement.payload, refinement.mask))
+    for selection, payload, mask in zip(_selections(strips), payloads, masks, strict=True):
+        steps = range_patch(selection, decode_range(payload, codec, selection.sample_shape, refinement.quality))
+        _apply_mask(mask, steps)
+        patches.append(steps)
+    return patches
+
+
+def _texture_patches(refinement: Refinement, strips: Strips) -> list[ImageArray]:
+    """The same of texture."""
+    parts = zip(_selections(strips), split_parts(refinement.payload, len(strips)), strict=True)
+    return [texture_patch(one, texture_of(refinement, one.sample_shape, payload)) for one, payload in parts]
+
+
+def texture_of(refinement: Refinement, shape: tuple[int, int], payload: bytes | None = None) -> ImageArray:
+    """Transmitted texels, shape + (3,). payload : a strip's; None: all. Raises CodecError, RemoteWireError."""
     if refinement.mask:
         raise RemoteWireError(f"{name_of(refinement)}: texture has no voids of its own")
     codec = _codec(TextureCodec, refinement.codec)
-    return decode_texture(refinement.payload, codec, refinement.quality, shape)
+    return decode_texture(refinement.payload if payload is None else payload, codec, refinement.quality, shape)
 
 
-def _apply_mask(refinement: Refinement, steps: StepArray) -> None:
-    if refinement.mask:
-        steps[decode_mask(refinement.mask, (steps.shape[0], steps.shape[1]))] = VOID
+def _apply_mask(mask: bytes, steps: StepArray) -> None:
+    if mask:
+        steps[decode_mask(mask, (steps.shape[0], steps.shape[1]))] = VOID
 
 
 def _rank(refinement: Refinement) -> int:
@@ -249,14 +264,13 @@ def _codec(kind: type[Codec], number: int) -> Codec:
         raise CodecError(f"no codec {number}") from None
 
 
-def _only_finer(
-    selection: Selection, adopted: BoolArray, held: ChannelHoldings, rank: int
-) -> tuple[Selection, BoolArray]:
-    """Of a selection planned over the first view alone, the blocks that make what we hold finer (F-09c)."""
+def _only_finer(strip: Strip, held: ChannelHoldings, rank: int) -> Strip:
+    """Of a strip planned over the first view alone, the blocks that make what we hold finer (F-09c)."""
+    selection, adopted = strip.selection, strip.adopted
     rows, columns = np.flatnonzero(adopted.any(1)), np.flatnonzero(adopted.any(0))
     finer = adopted & held.adoptable(selection.lattice, rank)
     core = finer[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return replace(selection, adopted=core), finer
+    return Strip(replace(selection, adopted=core), finer)
 
 
 def _read_only(array: Array) -> Array:

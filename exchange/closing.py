@@ -22,7 +22,7 @@ from exchange.profile import columns_mm, meet, profiles, sample_rows, strips
 from exchange.rays import LevelRays, StarRays
 from exchange.star import CANDIDATES, DEPTH_TOLERANCE, HIDDEN_MAX, INSIDE_MIN, NEAR_ENOUGH, nearest_round, solid_share
 from protocol.grid import HEIGHT_MAX, STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray
-from protocol.rings import thin_rings
+from protocol.rings import thin_grid
 
 COLUMNS_LOOKED_AT = 180  # tell where a centre may stand and how many rows are needed
 EDGE_ON_ROWS = 4.0  # samples further apart than that, as the centre sees them, say little of what is between them
@@ -93,7 +93,7 @@ def close_scan(
     progress(0.2)
     spec = replace(view.spec, pitch_mm=math.pi * float(np.nanmean(range_mm)) / view.spec.height)
     texture = _texture(view, others, lambda share: progress(0.2 + 0.8 * share))
-    closed = Grid(spec, thin_rings(to_steps(range_mm, spec.step_mm)), texture)
+    closed = thin_grid(Grid(spec, to_steps(range_mm, spec.step_mm), texture))
     hidden = _hidden(view, closed)
     if hidden > HIDDEN_MAX:
         raise ExchangeError(

@@ -8,7 +8,8 @@
     repairs     (n, 3) int32, range cells that are not as they were measured, row by row: row, column, steps measured
                 there (0 = nothing); optional
     note        how the scan was made, where its geometry is not as it was measured; optional
-    geometry    "sphere" for directions from a centre at z_max_mm on the axis, rings thinned; optional: "cylinder"
+    geometry    "sphere" for directions from a centre at z_max_mm on the axis, rings of depth thinned; optional:
+                "cylinder"
 
 The keys are those of make_cyl.py. What a member says of its shape is checked before anything is allocated.
 """
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 from exchange.errors import ExchangeError
 from protocol.grid import HEIGHT_MAX, WIDTH_MAX, Geometry, Grid, GridSpec, ImageArray, RepairArray, no_repairs
-from protocol.rings import thin_rings
+from protocol.rings import thin_rings, thin_texture
 
 NAME_MAX = 200
 NOTE_MAX = 1000
@@ -137,6 +138,7 @@ def _read(members: _Members, texture: ImageArray | None) -> Scanned:
         spec = _spec(members, depth.shape, texels.shape)
         if spec.geometry == "sphere" and not np.array_equal(depth, thin_rings(depth)):
             raise ExchangeError("depth_u16: a sphere's rings near the poles must be thinned (protocol/rings.py)")
+        texels = thin_texture(texels) if spec.geometry == "sphere" else texels
         grid = Grid(spec, depth, texels, _repairs(members))
         return Scanned(_text(members, "name", NAME_MAX), grid, _text(members, "note", NOTE_MAX))
     except ValueError as problem:

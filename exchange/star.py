@@ -16,7 +16,7 @@ import numpy as np
 from exchange.cast import STEP_MIN_MM, Mesh, cast_mesh
 from exchange.errors import ExchangeError
 from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec
-from protocol.rings import thin_rings
+from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid, directions
 
 LOOK = (180, 90, 1, 1)  # rays that tell whether a mesh is closed
@@ -72,7 +72,7 @@ def close_mesh(
     grid = cast_mesh(mesh, spec, progress)
     mean_mm = spec.step_mm * float(grid.range_steps[_measured(grid)].mean())
     spec = replace(spec, pitch_mm=math.pi * mean_mm / spec.height)
-    grid = Grid(spec, thin_rings(grid.range_steps), grid.texture)
+    grid = thin_grid(replace(grid, spec=spec))
     seen = Seen(centre_mm, _hidden(mesh.corners, grid), solid_share(~_measured(grid)))
     if seen.open > OPEN_MAX:
         raise ExchangeError(

@@ -20,7 +20,7 @@ from protocol.codec import JPEG_QUALITY_MAX, TextureCodec
 from protocol.errors import LatticeError, RemoteWireError
 from protocol.holdings import ChannelHoldings
 from protocol.lattice import Channel
-from protocol.region import region_round
+from protocol.sphere import region_on
 
 
 @dataclass(slots=True, eq=False)
@@ -109,7 +109,7 @@ def choose_codec(codecs: Sequence[m.CodecName], scan: Scan, look: m.Look, model:
     if codecs[0] != "jpeg" or "htj2k" not in codecs or model is None:
         return codecs[0]
     share = look.window if look.scale is None else look.scale**2
-    window = region_round(look.u, look.v, share, scan.spec.texture_width, scan.spec.texture_height)
+    window = region_on(scan.spec, look.u, look.v, share, scan.spec.texture_width, scan.spec.texture_height)
     best = model.expect(window, TextureCodec.JPEG).mse(JPEG_QUALITY_MAX)
     return "jpeg" if best <= mse_of_db(look.texture_db) else "htj2k"
 

@@ -5,44 +5,75 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from node.state import ClientState
-from protocol.grid import BoolArray, ImageArray, StepArray
-from protocol.lattice import NO_SKIRT, RHO_MAX, RHO_ONE, Channel, Parameters
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, BoolArray, ImageArray, StepArray
+from protocol.lattice import NO_SKIRT, RHO_MAX, RHO_ONE, Channel, Parameters, mask_to_runs
 from protocol.reconstruct import Selection
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
+from protocol.region import Region
+from protocol.strips import Strip, Strips, join_parts, samples_of
 
 FRAME_BYTES = 10  # WebSocket's own, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Coded:
-    """Samples of a lattice, encoded.
+class Part:
+    """What one strip of a refinement carries, encoded.
 
-    adopted : (by, bx) bool over the lattice's covered blocks.
-    rank, quality, codec : as in protocol.holdings and protocol.refinement.
     decoded : range only, the samples as a client decodes them.
-    patch : texture only, the dense rectangle that a client makes of it; None where nobody measured it.
+    patch : texture only, the patch that a client makes of it; None where nobody measured it.
     """
 
-    selection: Selection
-    adopted: BoolArray
-    rank: int
-    quality: int
-    codec: int
+    strip: Strip
     payload: bytes
     mask: bytes = b""
     decoded: StepArray | None = None
     patch: ImageArray | None = None
 
     @property
+    def selection(self) -> Selection:
+        """What the strip carries."""
+        return self.strip.selection
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coded:
+    """Samples of a lattice, encoded: in one part, on a sphere in one for each strip.
+
+    rank, quality, codec : as in protocol.holdings and protocol.refinement.
+    """
+
+    parts: tuple[Part, ...]
+    rank: int
+    quality: int
+    codec: int
+
+    @property
     def channel(self) -> Channel:
         """What it carries."""
-        return self.selection.lattice.shape.channel
+        return self.parts[0].selection.lattice.shape.channel
 
     @property
     def parameters(self) -> Parameters:
         """What travels of its lattice."""
-        return self.selection.lattice.parameters
+        return self.parts[0].selection.lattice.parameters
+
+    @property
+    def strips(self) -> Strips:
+        """What it carries, before it was encoded."""
+        return tuple(part.strip for part in self.parts)
+
+    @property
+    def payload(self) -> bytes:
+        """Its values."""
+        return join_parts([part.payload for part in self.parts])
+
+    @property
+    def mask(self) -> bytes:
+        """Where it is void."""
+        return join_parts([part.mask for part in self.parts])
 
     @property
     def wire_bytes(self) -> int:
@@ -52,13 +83,14 @@ class Coded:
     def refinement(self, epoch: int, seq: int, look: int) -> Refinement:
         """The wire record."""
         return Refinement(
-            Generator.FOVEA, self.channel, epoch, seq, look, self.codec, self.quality, self.selection.samples,
+            Generator.FOVEA, self.channel, epoch, seq, look, self.codec, self.quality, samples_of(self.strips),
             self.payload, self.mask, self.parameters,
         )  # fmt: skip
 
     def note(self, state: ClientState) -> None:
         """Record in a client's state that it holds this now."""
-        state.holdings.channels[self.channel].adopt(self.selection.lattice, self.adopted, self.rank)
+        for strip in self.strips:
+            state.holdings.channels[self.channel].adopt(strip.selection.lattice, strip.adopted, self.rank)
 
 
 def wire_overhead(parameters: Parameters) -> int:
@@ -71,3 +103,19 @@ def rho_of(s: float | None) -> int:
     if s is None:
         return NO_SKIRT
     return min(max(round(RHO_ONE * math.exp(1 / s)), RHO_ONE), RHO_MAX)
+
+
+def region_lattice(region: Region, channel: Channel, half_spacing: int, rho: int = NO_SKIRT) -> Parameters:
+    """The lattice of the blocks that a region touches; of a cap they are listed, and it has no skirt."""
+    side = RANGE_BLOCK if channel is Channel.RANGE else TEXTURE_BLOCK
+    touched = region.touched(side)
+    if touched.all():
+        return Parameters(half_spacing, *region.blocks(side), rho, rho)
+    return Parameters(half_spacing, *region.blocks(side), listed=mask_to_runs(touched))
+
+
+def own_inside(region: Region, selection: Selection) -> BoolArray:
+    """Which own samples of a selection's rectangle lie in a region. (rows, columns) bool"""
+    rows = selection.y.start + np.arange(selection.y.low.size)
+    columns = selection.x.start + np.arange(int(selection.x.size.sum()))
+    return region.inside(rows, columns * selection.lattice.shape.stride)

@@ -49,11 +49,12 @@ from node.refine_texture import (
 )
 from node.state import ClientState
 from node.texture_model import Expected, TextureModel
-from protocol.grid import RANGE_BLOCK
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK
 from protocol.lattice import Channel, Parameters
 from protocol.messages import CodecName, Look, RangeParameters, TextureParameters
 from protocol.region import Region
 from protocol.sphere import region_on
+from protocol.strips import blocks_of, samples_of
 
 REPLY_BYTES = 220  # the Updated message that ends an update, carrier included
 RANGE_OVERHEAD_BYTES = wire_overhead(Parameters(2, 0, 0, 1, 1)) + 64  # a void mask included
@@ -67,6 +68,7 @@ GENERIC_BYTES_PER_TEXEL = 0.04
 QUANTA_PER_SPACING = 6
 SKIRT_S = 1.0
 SKIRTS = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0)
+CAPS: tuple[tuple[Literal[2, 4, 8], float], ...] = ((2, 2.5), (4, 6.0), (8, 16.0))  # spacing, how much more area
 SKIRT_MARGIN = 2.0  # a skirt's cells differ more from each other than a window's texels
 
 Reason = Literal["complete", "byte limit", "superseded"]
@@ -153,12 +155,18 @@ class _Planner:
         self._encodes = 0
         self._limited = False
         self._texture_db: float | None = None
-        s = scan.spec
-        window = look.window if look.scale is None else look.scale**2
-        self._range_region = region_on(s, look.u, look.v, window, s.width, s.height)
-        self._texture_region = region_on(s, look.u, look.v, window, s.texture_width, s.texture_height)
-        self._target_steps = look.range_mm / s.step_mm
+        self._window = look.window if look.scale is None else look.scale**2
+        self._range_region, self._texture_region = self._regions(self._window)
+        self._target_steps = look.range_mm / scan.spec.step_mm
         self._target_mse = mse_of_db(look.texture_db)
+
+    def _regions(self, window: float) -> tuple[Region, Region]:
+        """What a share of the area round the click is of range and of texture."""
+        s, u, v = self._scan.spec, self._look.u, self._look.v
+        return (
+            region_on(s, u, v, window, s.width, s.height),
+            region_on(s, u, v, window, s.texture_width, s.texture_height),
+        )
 
     def run(self) -> None:
         """Choose, encode and note the refinements."""
@@ -223,10 +231,10 @@ class _Planner:
 
     def _range_bytes(self, wanted: RangeParameters) -> float:
         """What range is expected to take on the wire; 0 when the client holds it already."""
-        found = select_range(self._state, self._range_region, wanted)
-        if found is None:
+        strips, quantum = select_range(self._state, self._range_region, wanted)
+        if not strips:
             return 0.0
-        return RANGE_OVERHEAD_BYTES + RANGE_MARGIN * expected_range_bytes(self._scan, found[0], found[2])
+        return RANGE_OVERHEAD_BYTES + RANGE_MARGIN * expected_range_bytes(self._scan, strips, quantum)
 
     def _shortfall(self, doubled: int, texture_left: float) -> float:
         """How far an update falls short, in doublings of error, when texture is left so many bytes."""
@@ -240,8 +248,8 @@ class _Planner:
     def _expected(self) -> Expected:
         """What texture takes and reaches in the window."""
         if self._model is None:
-            area = self._texture_region.width * self._texture_region.height
-            return Expected.generic(self._target_mse, max(area * GENERIC_BYTES_PER_TEXEL, 64.0))
+            expected_bytes = self._texture_region.area * GENERIC_BYTES_PER_TEXEL
+            return Expected.generic(self._target_mse, max(expected_bytes, 64.0))
         return self._model.expect(self._texture_region, CODECS[self._codec])
 
     # -- texture ---------------------------------------------------------------------------------------------------
@@ -306,14 +314,15 @@ class _Planner:
         """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""
         region = self._texture_region
         total, count = 0.0, 0
-        if coded is not None and coded.patch is not None:
-            total, count = adopted_error(self._scan, coded.selection, region, coded.patch)
+        if coded is not None:
+            total, count = adopted_error(self._scan, coded, region)
         held_total, held_count = held_error(self._state, coded, region, self._model, self._target_mse)
         return (total + held_total) / max(count + held_count, 1)
 
     def _learn(self, p: float, quality: int, coded: Coded) -> None:
         if self._model is not None and p == 1:
-            share = coded.selection.adopted.mean()
+            touched = self._texture_region.touched(TEXTURE_BLOCK).sum()
+            share = min(blocks_of(coded.strips).size / touched, 1.0)
             self._model.learn(CODECS[self._codec], share * self._expected().size_bytes(quality), len(coded.payload))
 
     # -- range -----------------------------------------------------------------------------------------------------
@@ -364,22 +373,45 @@ class _Planner:
     # -- the periphery ---------------------------------------------------------------------------------------------
 
     def _fill_periphery(self, wanted: RangeParameters) -> None:
-        """Spend what is left round the window: the widest skirt that is expected to fit, range first."""
+        """Spend what is left round the window, range first: the widest skirt that is expected to fit, on a sphere caps
+        ever wider and coarser."""
+        last = next((coded for coded in reversed(self._coded) if coded.channel is Channel.TEXTURE), None)
+        texture = None
+        if last is not None:
+            sample_bytes = len(last.payload) / samples_of(last.strips)
+            texture = TextureParameters(last.parameters.spacing, last.quality, self._codec), sample_bytes
+        if self._scan.spec.geometry == "sphere":
+            self._fill_caps(wanted, texture)
+            return
         for s in SKIRTS:
             if self._range_bytes(msgspec.structs.replace(wanted, s=s)) <= self._left:
                 self._take(self._code_range(msgspec.structs.replace(wanted, s=s)))
                 break
-        last = next((coded for coded in reversed(self._coded) if coded.channel is Channel.TEXTURE), None)
-        if last is None:
-            return
-        sample_bytes = len(last.payload) / last.selection.samples
-        inner = TextureParameters(last.parameters.spacing, last.quality, self._codec)
-        for s in SKIRTS:
-            texture = msgspec.structs.replace(inner, s=s)
-            found, _ = select_texture(self._state, self._texture_region, texture)
-            if found and found[0].samples * found[0].adopted.mean() * sample_bytes * SKIRT_MARGIN <= self._left:
-                self._take(self._code_texture(texture))
-                return
+        if texture is not None:
+            for s in SKIRTS:
+                if self._texture_fits(texture, s):
+                    self._take(self._code_texture(msgspec.structs.replace(texture[0], s=s)))
+                    return
+
+    def _texture_fits(self, texture: tuple[TextureParameters, float], s: float | None) -> bool:
+        """Whether texture with a skirt is expected to fit what is left; bytes a sample as in the window."""
+        parameters, sample_bytes = texture
+        strips, _ = select_texture(self._state, self._texture_region, msgspec.structs.replace(parameters, s=s))
+        seen = sum(strip.selection.samples * strip.selection.adopted.mean() for strip in strips)
+        return bool(strips) and seen * sample_bytes * SKIRT_MARGIN <= self._left
+
+    def _fill_caps(self, wanted: RangeParameters, texture: tuple[TextureParameters, float] | None) -> None:
+        window = self._range_region, self._texture_region
+        for p, wider in CAPS:
+            self._range_region, self._texture_region = self._regions(min(self._window * wider, 1.0))
+            coarser = msgspec.structs.replace(wanted, p=max(p, wanted.p))
+            if self._range_bytes(coarser) <= self._left:
+                self._take(self._code_range(coarser))
+            if texture is not None:
+                of_cap = msgspec.structs.replace(texture[0], p=max(p, texture[0].p)), texture[1]
+                if self._texture_fits(of_cap, None):
+                    self._take(self._code_texture(of_cap[0]))
+        self._range_region, self._texture_region = window
 
     # -- one refinement --------------------------------------------------------------------------------------------
 
@@ -394,7 +426,9 @@ class _Planner:
     def _code_listed(self, wanted: TextureParameters, listed: tuple[int, ...] | None) -> Coded | None:
         """The same for some blocks of the window (None: all)."""
         self._count_encode()
-        parameters = replace(texture_lattice(self._texture_region, wanted), listed=listed)
+        parameters = texture_lattice(self._texture_region, wanted)
+        if listed is not None:
+            parameters = replace(parameters, listed=listed)
         codec = CODECS[wanted.codec]
         return code_texture_lattice(
             self._scan, self._state, parameters, wanted.quality, codec, quick=self._quick
@@ -437,4 +471,5 @@ def _error_in(state: ClientState, region: Region) -> float:
     """Largest range error left in the blocks a region touches. [steps]"""
     left, top, wide, high = region.blocks(RANGE_BLOCK)
     columns = np.arange(left, left + wide) % state.error.shape[1]
-    return float(state.error[top : top + high][:, columns].max(initial=0))
+    touched = region.touched(RANGE_BLOCK)
+    return float(state.error[top : top + high][:, columns].max(where=touched, initial=0))

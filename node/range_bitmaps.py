@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from node.coded import Coded
+from node.coded import Coded, Part, own_inside
 from node.library import Scan
 from node.refine_range import (
     PERCENTILE,
@@ -30,6 +30,7 @@ from protocol.lattice import Channel, ChannelShape, mask_to_runs
 from protocol.messages import RangeParameters
 from protocol.reconstruct import cut
 from protocol.region import Region
+from protocol.strips import blocks_of
 
 LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
 TRIES_MAX = 4
@@ -46,10 +47,11 @@ def reach_range(
     again by itself, finer.
     """
     held = state.holdings.channels[Channel.RANGE]
-    rank = _of_region(held.rank, region)
-    good = (rank > COARSE_RANK) & (state.cells_beyond(target_steps, region) <= FEW_CELLS)
-    better = rank > range_rank(wanted.quantum)
-    apart = good | better if better.any() or good.mean() >= LISTED_SHARE else np.zeros_like(good)
+    rank, touched = _of_region(held.rank, region), region.touched(RANGE_BLOCK)
+    good = touched & (rank > COARSE_RANK) & (state.cells_beyond(target_steps, region) <= FEW_CELLS)
+    better = touched & (rank > range_rank(wanted.quantum))
+    apart = good | better if better.any() or good[touched].mean() >= LISTED_SHARE else np.zeros_like(good)
+    apart |= ~touched
     allowed = _allowed_beyond(scan, region)
     coded = _code_listed(scan, state, region, wanted, apart)
     for _ in range(TRIES_MAX):
@@ -120,29 +122,31 @@ def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:
     """Which blocks a refinement changes. (blocks_y, blocks_x)"""
     adopted = np.zeros(shape.blocks, np.bool_)
     if coded is not None:
-        adopted.ravel()[coded.selection.adopted_blocks()] = True
+        adopted.ravel()[blocks_of(coded.strips)] = True
     return adopted
 
 
 def _allowed_beyond(scan: Scan, region: Region) -> int:
     """How many measured cells of a region may be further off than its target (99th percentile, "higher")."""
-    measured = int(np.count_nonzero(scan.range_steps[region.rows][:, region.columns]))
+    rows = np.arange(region.top, region.top + region.height)
+    inside = region.inside(rows, np.arange(scan.spec.width))
+    measured = int(np.count_nonzero(inside & (scan.range_steps[region.rows] != VOID)))
     return max(measured - 1, 0) * (100 - PERCENTILE) // 100
 
 
 def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps: float) -> int:
     """How many of a region's cells a refinement leaves further off than target_steps."""
-    if coded is None:
-        return 0
-    selection = coded.selection
-    rows = selection.y.start + np.arange(selection.y.low.size)
-    columns = selection.x.start + np.arange(selection.x.low.size)
-    inside = (rows >= region.top) & (rows < region.top + region.height)
-    across = (columns - region.left) % region.turn < region.width
-    truth = np.asarray(cut(scan.range_steps, selection), np.int32)
-    far = np.abs(client_range(scan, coded).astype(np.int32) - truth) > target_steps
-    far &= (truth != VOID) & selection.adopted_cells()
-    return int(np.count_nonzero(far[inside][:, across]))
+    return sum(_part_beyond(scan, part, region, target_steps) for part in coded.parts) if coded is not None else 0
+
+
+def _part_beyond(scan: Scan, part: Part, region: Region, target_steps: float) -> int:
+    """The same of a strip. An own sample counts for the cells up to the next one too."""
+    selection, inside = part.selection, own_inside(region, part.selection)
+    own = slice(0, inside.shape[1])
+    truth = np.asarray(cut(scan.range_steps, selection), np.int32)[:, own]
+    far = np.abs(client_range(scan, part)[:, own].astype(np.int32) - truth) > target_steps
+    far &= (truth != VOID) & selection.adopted_cells() & inside
+    return selection.lattice.shape.stride * int(np.count_nonzero(far))
 
 
 def _of_region(blocks: NDArray[Any], region: Region) -> NDArray[Any]:

@@ -11,18 +11,19 @@ from typing import Literal
 
 import numpy as np
 
-from node.coded import Coded, rho_of
+from node.coded import Coded, Part, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
-from protocol.grid import RANGE_BLOCK, VOID, BoolArray, StepArray
+from protocol.codec_lift import encode_and_decode, survey
+from protocol.grid import RANGE_BLOCK, VOID, IntArray, StepArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
-from protocol.lattice import Channel, Lattice, Parameters, build_lattice
+from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import RangeParameters
-from protocol.range_payload import encode_selection, survey_selection
-from protocol.reconstruct import Selection, content_hashes, cut, range_patch, select
+from protocol.reconstruct import Selection, content_hashes, cut, range_patch
 from protocol.region import Region
+from protocol.strips import Strip, Strips, build_strips, select_strips
 
 SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
 PERCENTILE = 99
@@ -45,10 +46,10 @@ def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: f
     fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
     best: Choice | None = None
     for p in SPACINGS:
-        selection = _trial_selection(fresh, region, p)
-        if selection is None or (p > 1 and target_steps < 1):
+        strips = _trial_strips(fresh, region, p)
+        if not strips or (p > 1 and target_steps < 1):
             continue
-        trial = _Trial(scan, selection, region)
+        trial = _Trial(scan, strips, region)
         if trial.error(1) > target_steps:
             continue
         quantum = _largest_quantum(trial, target_steps)
@@ -70,52 +71,54 @@ def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangePara
 
 def code_range_lattice(scan: Scan, state: ClientState, parameters: Parameters, quantum: int) -> Coded | None:
     """The same for a lattice that is given."""
-    found = select_range_lattice(state, parameters, quantum)
-    if found is None:
+    strips, quantum = select_range_lattice(state, parameters, quantum)
+    if not strips:
         return None
-    selection, adopted, quantum = found
-    samples, seen = range_samples(scan, selection)
-    payload, decoded = encode_selection(selection, samples, quantum, seen)
-    mask = encode_mask(void_cells(scan, selection))
-    return Coded(selection, adopted, range_rank(quantum), quantum, RangeCodec.LIFT, payload, mask, decoded)
+    parts = tuple(_code_strip(scan, strip, quantum) for strip in strips)
+    return Coded(parts, range_rank(quantum), quantum, RangeCodec.LIFT)
 
 
-def client_range(scan: Scan, coded: Coded) -> StepArray:
-    """The dense rectangle that a client makes of a range refinement, voids included."""
-    assert coded.decoded is not None  # code_range_lattice keeps it
-    patch = range_patch(coded.selection, coded.decoded)
-    patch[void_cells(scan, coded.selection)] = VOID
+def _code_strip(scan: Scan, strip: Strip, quantum: int) -> Part:
+    samples, seen = range_samples(scan, strip.selection)
+    payload, decoded = encode_and_decode(samples, quantum, seen)
+    return Part(strip, payload, encode_mask(void_cells(scan, strip.selection)), decoded)
+
+
+def client_range(scan: Scan, part: Part) -> StepArray:
+    """The patch that a client makes of a strip's range, voids included."""
+    assert part.decoded is not None  # _code_strip keeps it
+    patch = range_patch(part.selection, part.decoded)
+    patch[void_cells(scan, part.selection)] = VOID
     return patch
 
 
-def select_range(
-    state: ClientState, region: Region, wanted: RangeParameters
-) -> tuple[Selection, BoolArray, int] | None:
-    """What code_range would carry: the selection, the adopted blocks of its lattice, the quantum; None: nothing."""
+def select_range(state: ClientState, region: Region, wanted: RangeParameters) -> tuple[Strips, int]:
+    """What code_range would carry, if anything, and its quantum."""
     return select_range_lattice(state, range_lattice(region, wanted), wanted.quantum)
 
 
-def select_range_lattice(
-    state: ClientState, parameters: Parameters, quantum: int
-) -> tuple[Selection, BoolArray, int] | None:
+def select_range_lattice(state: ClientState, parameters: Parameters, quantum: int) -> tuple[Strips, int]:
     """The same for a lattice that is given."""
     held = state.holdings.channels[Channel.RANGE]
-    lattice = build_lattice(held.shape, parameters)
-    quantum = min(quantum, _best_held(held, lattice))
-    found = select(lattice, held, range_rank(quantum))
-    return (*found, quantum) if found else None
+    lattices = build_strips(held.shape, parameters)
+    quantum = min([quantum, *(_best_held(held, lattice) for lattice in lattices)])
+    return select_strips(lattices, held, range_rank(quantum)), quantum
 
 
-def expected_range_bytes(scan: Scan, selection: Selection, quantum: int) -> float:
-    """About how many bytes a selection's payload takes."""
+def expected_range_bytes(scan: Scan, strips: Strips, quantum: int) -> float:
+    """About how many bytes the payload takes."""
+    return sum(_surveyed(scan, strip.selection, quantum) for strip in strips)
+
+
+def _surveyed(scan: Scan, selection: Selection, quantum: int) -> float:
     samples, seen = range_samples(scan, selection)
-    return survey_selection(selection, samples, quantum, seen)[1]
+    return survey(samples, quantum, seen)[1]
 
 
 def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
     """The lattice of a region's blocks."""
     rho = rho_of(wanted.s)
-    return Parameters(2 * wanted.p, *region.blocks(8), rho, rho)
+    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho)
 
 
 def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:
@@ -126,34 +129,31 @@ def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float
 
 def settle_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:
     """The part of note_range that can wait until the refinement is on its way: digest and errors."""
-    patch, selection = client_range(scan, coded), coded.selection
-    state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
-    truth = np.asarray(cut(scan.range_steps, selection), np.uint16)
-    error, far = block_errors(patch, truth, selection.y.size, selection.x.size, target_steps)
-    rows, columns = np.nonzero(selection.adopted)
-    blocks = selection.y.block[rows], selection.x.block[columns]
-    state.error[blocks], state.target_steps[blocks] = error[rows, columns], target_steps
-    cells = np.arange(RANGE_BLOCK)
-    to, place = blocks[0][:, None] * RANGE_BLOCK + cells, rows[:, None] * RANGE_BLOCK + cells
-    state.far[to, blocks[1][:, None]] = far[place, columns[:, None]]
+    for part in coded.parts:
+        patch, selection = client_range(scan, part), part.selection
+        state.holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
+        truth = np.asarray(cut(scan.range_steps, selection), np.uint16)
+        own, stride = slice(0, int(selection.x.size.sum())), selection.lattice.shape.stride
+        error, far = block_errors(
+            patch[:, own], truth[:, own], selection.y.size, selection.x.size, target_steps, stride
+        )
+        rows, columns = np.nonzero(selection.adopted)
+        blocks = selection.y.block[rows], selection.x.block[columns]
+        state.error[blocks], state.target_steps[blocks] = error[rows, columns], target_steps
+        cells = np.arange(RANGE_BLOCK)
+        to, place = blocks[0][:, None] * RANGE_BLOCK + cells, rows[:, None] * RANGE_BLOCK + cells
+        state.far[to, blocks[1][:, None]] = far[place, columns[:, None]]
 
 
 class _Trial:
     """One spacing over a region: what error a quantum leaves."""
 
-    def __init__(self, scan: Scan, selection: Selection, region: Region) -> None:
-        self._selection = selection
-        self._samples, self._seen = range_samples(scan, selection)
-        top, left = region.top - selection.y.start, (region.left - selection.x.start) % region.turn
-        columns = (left + np.arange(region.width)) % region.turn
-        self._place = np.ix_(np.arange(top, top + region.height), columns)
-        truth = scan.range_steps[region.rows][:, region.columns]
-        self._measured = truth != VOID
-        self._truth = truth[self._measured].astype(np.int32)
+    def __init__(self, scan: Scan, strips: Strips, region: Region) -> None:
+        self._parts = [_TrialPart(scan, strip.selection, region) for strip in strips]
         self._known: dict[int, tuple[float, float]] = {}
 
     def error(self, quantum: int) -> float:
-        """99th percentile ("higher") of the error over measured cells of the region. [steps]"""
+        """99th percentile ("higher") of the error over measured own samples of the region. [steps]"""
         return self._measure(quantum)[0]
 
     def expected_bytes(self, quantum: int) -> float:
@@ -162,11 +162,36 @@ class _Trial:
 
     def _measure(self, quantum: int) -> tuple[float, float]:
         if quantum not in self._known:
-            samples, size_bytes = survey_selection(self._selection, self._samples, quantum, self._seen)
-            patch = range_patch(self._selection, samples)[self._place]
-            error = np.abs(patch[self._measured].astype(np.int32) - self._truth)
-            self._known[quantum] = percentile_higher(error, PERCENTILE) if error.size else 0.0, size_bytes
+            found = [part.measure(quantum) for part in self._parts]
+            error = np.concatenate([error for error, _ in found])
+            largest = percentile_higher(error, PERCENTILE) if error.size else 0.0
+            self._known[quantum] = largest, sum(size_bytes for _, size_bytes in found)
         return self._known[quantum]
+
+
+class _TrialPart:
+    """A strip of it."""
+
+    def __init__(self, scan: Scan, selection: Selection, region: Region) -> None:
+        self._selection = selection
+        self._samples, self._seen = range_samples(scan, selection)
+        inside = own_inside(region, selection)
+        rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
+        self._crop = _around(rows), _around(columns)
+        truth = np.asarray(cut(scan.range_steps, selection))[self._crop]
+        self._counts = inside[self._crop] & (truth != VOID)
+        self._truth = truth[self._counts].astype(np.int32)
+
+    def measure(self, quantum: int) -> tuple[IntArray, float]:
+        """Error of every measured own sample in the region [steps], and about how many bytes the strip takes."""
+        samples, size_bytes = survey(self._samples, quantum, self._seen)
+        patch = range_patch(self._selection, samples)[self._crop]
+        return np.abs(patch[self._counts].astype(np.int32) - self._truth), size_bytes
+
+
+def _around(places: IntArray) -> slice:
+    """From the first to the last of ascending places."""
+    return slice(int(places[0]), int(places[-1]) + 1) if places.size else slice(0, 0)
 
 
 def percentile_higher(values: np.ndarray, percent: float) -> float:
@@ -181,12 +206,12 @@ def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:
     return 65535 - int(held.rank[where][improves].max(initial=COARSE_RANK))
 
 
-def _trial_selection(fresh: ChannelHoldings, region: Region, p: int) -> Selection | None:
+def _trial_strips(fresh: ChannelHoldings, region: Region, p: int) -> Strips:
     if 2 * fresh.shape.width % (2 * p):
-        return None
-    parameters = Parameters(2 * p, *region.blocks(8))
-    found = select(build_lattice(fresh.shape, parameters), fresh, range_rank(1))
-    return found[0] if found else None
+        return ()
+    return select_strips(
+        build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p)), fresh, range_rank(1)
+    )
 
 
 def _largest_quantum(trial: _Trial, target_steps: float) -> int:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from node.coded import Coded, rho_of
+from node.coded import Coded, Part, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
@@ -17,10 +16,12 @@ from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
 from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
 from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
-from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, build_lattice, mask_to_runs
+from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, mask_to_runs
 from protocol.messages import CodecName, TextureParameters
-from protocol.reconstruct import Selection, cut, select, texture_patch
+from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
+from protocol.rings import ring_strides
+from protocol.strips import Strips, blocks_of, build_strips, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 SPACINGS = (8, 4, 2, 1)
@@ -39,12 +40,13 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
     shape = state.shapes[Channel.TEXTURE]
     allowed = mse_of_db(target_db) * SHARE_OF_ERROR
     for p in SPACINGS[:-1]:
-        selection = _whole(shape, region, p)
-        if selection is None:
-            continue
-        patch = texture_patch(selection, texture_samples(scan, selection))
-        total, count = adopted_error(scan, selection, region, patch)
-        if total <= allowed * count:
+        strips = _whole(shape, region, p)
+        total, count = 0.0, 0
+        for selection in (strip.selection for strip in strips):
+            patch = texture_patch(selection, texture_samples(scan, selection))
+            error, values = _patch_error(scan, selection, region, patch)
+            total, count = total + error, count + values
+        if strips and total <= allowed * count:
             return p
     return 1
 
@@ -67,13 +69,15 @@ def code_texture_lattice(
     scan: Scan, state: ClientState, parameters: Parameters, quality: int, codec: TextureCodec, *, quick: bool = False
 ) -> Coded | None:
     """The same for a lattice that is given."""
-    found, best = _select(state, parameters, quality)
-    if found is None:
+    strips, best = _select(state, parameters, quality)
+    if not strips:
         return None
     if best > quality and codec is TextureCodec.JPEG and best > JPEG_QUALITY_MAX:
         codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
-    payload = encode_texture(texture_samples(scan, found[0]), codec, best, quick=quick)
-    return Coded(*found, texture_rank(best), best, codec, payload)
+    texels = (texture_samples(scan, strip.selection) for strip in strips)
+    payloads = (encode_texture(image, codec, best, quick=quick) for image in texels)
+    parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
+    return Coded(parts, texture_rank(best), best, codec)
 
 
 def listed_texture(state: ClientState, region: Region, target_mse: float) -> tuple[int, ...] | None:
@@ -81,75 +85,75 @@ def listed_texture(state: ClientState, region: Region, target_mse: float) -> tup
     held = state.holdings.channels[Channel.TEXTURE]
     left, top, wide, high = region.blocks(TEXTURE_BLOCK)
     place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % held.shape.blocks[1])
-    good = (held.rank[place] > COARSE_RANK) & (state.missed[place] <= target_mse)
-    return mask_to_runs(~good) if good.mean() >= LISTED_SHARE else None
+    touched = region.touched(TEXTURE_BLOCK)
+    good = touched & (held.rank[place] > COARSE_RANK) & (state.missed[place] <= target_mse)
+    return mask_to_runs(touched & ~good) if good[touched].mean() >= LISTED_SHARE else None
 
 
-def select_texture(
-    state: ClientState, region: Region, wanted: TextureParameters
-) -> tuple[tuple[Selection, BoolArray] | None, int]:
-    """What code_texture would carry (the selection and the adopted blocks of its lattice; None: nothing), how good."""
+def select_texture(state: ClientState, region: Region, wanted: TextureParameters) -> tuple[Strips, int]:
+    """What code_texture would carry, if anything, and how good."""
     return _select(state, texture_lattice(region, wanted), wanted.quality)
 
 
-def _select(
-    state: ClientState, parameters: Parameters, quality: int
-) -> tuple[tuple[Selection, BoolArray] | None, int]:
+def _select(state: ClientState, parameters: Parameters, quality: int) -> tuple[Strips, int]:
     held = state.holdings.channels[Channel.TEXTURE]
-    lattice = build_lattice(held.shape, parameters)
-    best = max(quality, _best_held(held, lattice))
-    return select(lattice, held, texture_rank(best)), best
+    lattices = build_strips(held.shape, parameters)
+    best = max([quality, *(_best_held(held, lattice) for lattice in lattices)])
+    return select_strips(lattices, held, texture_rank(best)), best
 
 
 def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:
     """The lattice of a region's blocks."""
-    rho = rho_of(wanted.s)
-    return Parameters(round(2 * wanted.p), *region.blocks(16), rho, rho)
+    return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s))
 
 
 def note_texture(scan: Scan, state: ClientState, coded: Coded) -> None:
     """Record a texture refinement in a client's state: holdings, and the error left in its blocks where measured."""
     coded.note(state)
-    selection = coded.selection
-    rows, columns = np.nonzero(selection.adopted)
-    blocks = selection.y.block[rows], selection.x.block[columns]
-    state.missed[blocks] = np.nan if coded.patch is None else _block_errors(scan, coded)[rows, columns]
+    for part in coded.parts:
+        rows, columns = np.nonzero(part.selection.adopted)
+        blocks = part.selection.y.block[rows], part.selection.x.block[columns]
+        state.missed[blocks] = np.nan if part.patch is None else _block_errors(scan, part)[rows, columns]
 
 
-def _block_errors(scan: Scan, coded: Coded) -> NDArray[np.float32]:
-    """Squared error per value in each block of a measured refinement's rectangle."""
-    assert coded.patch is not None
-    selection = coded.selection
-    missed = cv2.absdiff(coded.patch, np.asarray(cut(scan.texture, selection)))
-    squared = cv2.multiply(missed, missed, dtype=cv2.CV_32F).sum(axis=2)
+def _block_errors(scan: Scan, part: Part) -> NDArray[np.float32]:
+    """Squared error per value in each block of a measured strip's rectangle."""
+    assert part.patch is not None
+    selection = part.selection
+    missed = cv2.absdiff(part.patch, np.asarray(cut(scan.texture, selection)))
+    squared = cv2.multiply(missed, missed, dtype=cv2.CV_32F).sum(axis=2)[:, : int(selection.x.size.sum())]
     starts_y, starts_x = (np.cumsum(window.size) - window.size for window in (selection.y, selection.x))
     total = np.add.reduceat(np.add.reduceat(squared, starts_y, axis=0), starts_x, axis=1)
     return np.asarray(total / (3 * np.multiply.outer(selection.y.size, selection.x.size)), np.float32)
 
 
 def measured(coded: Coded) -> Coded:
-    """A refinement with the dense texture that a client makes of it."""
-    texels = decode_texture(
-        coded.payload, TextureCodec(coded.codec), coded.quality, coded.selection.sample_shape
-    )
-    return replace(coded, patch=texture_patch(coded.selection, texels))
+    """A refinement with the texture that a client makes of it."""
+    return replace(coded, parts=tuple(_measured(part, coded) for part in coded.parts))
 
 
-def adopted_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, int]:
-    """Squared error of a dense patch over a region's adopted texels, and of how many values."""
-    adopted = selection.adopted_cells().view(np.uint8)
+def _measured(part: Part, coded: Coded) -> Part:
+    texels = decode_texture(part.payload, TextureCodec(coded.codec), coded.quality, part.selection.sample_shape)
+    return replace(part, patch=texture_patch(part.selection, texels))
+
+
+def adopted_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, int]:
+    """Squared error that a measured refinement leaves in a region's adopted own texels, and of how many values."""
     total, count = 0.0, 0
-    for rows, columns, source in selection.spans():
-        for inside in _overlaps(region, columns):
-            top, bottom = max(rows.start, region.top), min(rows.stop, region.top + region.height)
-            if top >= bottom:
-                continue
-            offset = source.start - columns.start
-            place = slice(top - rows.start, bottom - rows.start), slice(inside.start + offset, inside.stop + offset)
-            made, mask = np.ascontiguousarray(patch[place]), np.ascontiguousarray(adopted[place])
-            total += cv2.norm(made, np.ascontiguousarray(scan.texture[top:bottom, inside]), cv2.NORM_L2SQR, mask)
-            count += 3 * cv2.countNonZero(mask)
+    for part in coded.parts:
+        if part.patch is not None:
+            error, values = _patch_error(scan, part.selection, region, part.patch)
+            total, count = total + error, count + values
     return total, count
+
+
+def _patch_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, int]:
+    """The same of one strip's patch."""
+    wanted = (selection.adopted_cells() & own_inside(region, selection)).view(np.uint8)
+    own = slice(0, wanted.shape[1])
+    truth = np.asarray(cut(scan.texture, selection))[:, own]
+    total = cv2.norm(np.ascontiguousarray(patch[:, own]), np.ascontiguousarray(truth), cv2.NORM_L2SQR, wanted)
+    return total, 3 * cv2.countNonZero(wanted)
 
 
 def held_error(
@@ -159,12 +163,10 @@ def held_error(
 
     Blocks that were never measured count as the model expects them, or as just good enough without one.
     """
-    kept = np.ones(state.shapes[Channel.TEXTURE].blocks, np.bool_)
-    if coded is not None:
-        kept.ravel()[coded.selection.adopted_blocks()] = False
-    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    columns = np.arange(left, left + wide) % kept.shape[1]
-    rows, across = np.nonzero(kept[top : top + high][:, columns])
+    kept = _kept_in(state.shapes[Channel.TEXTURE], coded, region)
+    left, top, wide, _ = region.blocks(TEXTURE_BLOCK)
+    columns = np.arange(left, left + wide) % state.missed.shape[1]
+    rows, across = np.nonzero(kept)
     rows, across = rows + top, columns[across]
     mse = state.missed[rows, across].astype(np.float64)
     unknown = np.isnan(mse)
@@ -180,21 +182,31 @@ def held_error(
 def quality_to_mend(state: ClientState, coded: Coded | None, region: Region, target_mse: float) -> int:
     """The quality at which the too poor blocks that a refinement leaves as they are would be sent again; 0: none is."""
     held = state.holdings.channels[Channel.TEXTURE]
-    kept = np.ones(held.shape.blocks, np.bool_)
-    if coded is not None:
-        kept.ravel()[coded.selection.adopted_blocks()] = False
     left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % kept.shape[1])
-    poor = kept[place] & (state.missed[place] > target_mse)
+    place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % held.shape.blocks[1])
+    poor = _kept_in(held.shape, coded, region) & (state.missed[place] > target_mse)
     return int(held.rank[place][poor].max(initial=0)) - 1 + RANK_MARGIN[Channel.TEXTURE] if poor.any() else 0
 
 
+def _kept_in(shape: ChannelShape, coded: Coded | None, region: Region) -> BoolArray:
+    """Which of a region's blocks a refinement leaves as they are. (rows, columns) of Region.blocks"""
+    kept = np.ones(shape.blocks, np.bool_)
+    if coded is not None:
+        kept.ravel()[blocks_of(coded.strips)] = False
+    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
+    columns = np.arange(left, left + wide) % kept.shape[1]
+    return kept[top : top + high][:, columns] & region.touched(TEXTURE_BLOCK)
+
+
 def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> IntArray:
-    """How many of each block's values lie in a region."""
+    """How many of each block's own values lie in a region; of a cap's all that are in its blocks."""
     top, left = rows * TEXTURE_BLOCK, columns * TEXTURE_BLOCK
     bottom = np.minimum(top + TEXTURE_BLOCK, shape.height)
-    height = np.minimum(bottom, region.top + region.height) - np.maximum(top, region.top)
     size = np.minimum(TEXTURE_BLOCK, shape.width - left)
+    if shape.sphere:
+        stride = ring_strides(shape.width, shape.height, TEXTURE_BLOCK)[rows]
+        return np.asarray(3 * (bottom - top) * (size // stride), np.int64)
+    height = np.minimum(bottom, region.top + region.height) - np.maximum(top, region.top)
     across = (left[:, None] + np.arange(TEXTURE_BLOCK) - region.left) % region.turn < region.width
     width = (across & (np.arange(TEXTURE_BLOCK) < size[:, None])).sum(axis=1)
     return np.asarray(3 * np.maximum(height, 0) * width, np.int64)
@@ -215,21 +227,12 @@ def quality_bounds(codec: str) -> tuple[int, int]:
     return (JPEG_QUALITY_MIN, JPEG_QUALITY_MAX) if codec == "jpeg" else (0, LOSSY_MAX)
 
 
-def _overlaps(region: Region, columns: slice) -> Iterator[slice]:
-    """The parts of a run of columns (not wrapped) that lie in the region."""
-    for turn in (-region.turn, 0, region.turn):
-        start, stop = max(columns.start, region.left + turn), min(columns.stop, region.left + region.width + turn)
-        if start < stop:
-            yield slice(start, stop)
-
-
-def _whole(shape: ChannelShape, region: Region, p: float) -> Selection | None:
+def _whole(shape: ChannelShape, region: Region, p: float) -> Strips:
+    """What a client that has the first view alone would be sent of a region at a spacing, if it fits at all."""
     parameters = texture_lattice(region, TextureParameters(p=p))
     if parameters.blocks_wide == shape.blocks[1] and 2 * shape.width % parameters.half_spacing:
-        return None
-    fresh = ChannelHoldings.coarse(shape)
-    found = select(build_lattice(shape, parameters), fresh, texture_rank(0))
-    return found[0] if found else None
+        return ()
+    return select_strips(build_strips(shape, parameters), ChannelHoldings.coarse(shape), texture_rank(0))
 
 
 def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:

@@ -6,6 +6,8 @@ a texel. Source: REQUIREMENTS F-07b.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +23,9 @@ def range_samples(scan: Scan, selection: Selection) -> tuple[StepArray, BoolArra
 
     Seen are samples of adopted blocks that are measured or, where cells between samples hang on them, near such.
     """
-    lattice = selection.lattice
+    lattice, shape = selection.lattice, selection.lattice.shape
     rows = _run(lattice.y.border[selection.y.sample] // 2)
-    columns = _run(lattice.x.border[selection.x.sample] // 2 % scan.spec.width)
+    columns = _run(lattice.x.border[selection.x.sample] // 2 % shape.own_width * shape.stride)
     seen = np.asarray(scan.range_steps[rows][:, columns]) != VOID
     if lattice.parameters.half_spacing > 2:
         seen = cv2.dilate(seen.view(np.uint8), np.ones((3, 3), np.uint8)).astype(np.bool_)
@@ -50,19 +52,23 @@ def _stencil(selection: Selection) -> BoolArray:
 
 def _samples_of_blocks(window: Window) -> NDArray[np.float32]:
     """Which transmitted samples each block of an axis hangs on. (blocks, samples) float32, 0 or 1."""
-    block = np.repeat(np.arange(window.size.size), window.size)
-    hangs = np.zeros((window.size.size, window.sample.size), np.float32)
-    hangs[block, window.low] = 1
-    between = window.part > 0
-    hangs[block[between], window.high[between]] = 1
+    blocks = np.arange(window.size.size)
+    hangs = np.zeros((blocks.size, window.sample.size), np.float32)
+    starts = np.cumsum(window.size) - window.size
+    for block, position in [(blocks.repeat(window.size), np.arange(window.size.sum()))] + [
+        (blocks, starts + window.size)
+    ] * window.beyond:
+        hangs[block, window.low[position]] = 1
+        between = window.part[position] > 0
+        hangs[block[between], window.high[position[between]]] = 1
     return hangs
 
 
 def void_cells(scan: Scan, selection: Selection) -> BoolArray:
-    """Which cells of the selection's rectangle are adopted and void. (rows, columns) bool."""
+    """Which cells of a selection's patch are void, of those that are adopted or next to it. (rows, columns) bool."""
     void = np.asarray(cut(scan.range_steps, selection)) == VOID
     if not selection.adopted.all():
-        void &= selection.adopted_cells()
+        void &= selection.seen_cells()
     return np.asarray(void, np.bool_)
 
 
@@ -79,20 +85,34 @@ def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
 
 def _cell_means(scan: Scan, selection: Selection) -> ImageArray:
     lattice = selection.lattice
+    texture = _Texture.of(scan, lattice.shape.stride)
     y, x = _Cells(lattice.y, selection.y.sample), _Cells(lattice.x, selection.x.sample)
     spacing = lattice.parameters.half_spacing
     core_y, core_x = y.plateau(spacing), x.plateau(spacing)
     core_borders = y.border[core_y.start : core_y.stop + 1], x.border[core_x.start : core_x.stop + 1]
-    core = _plateau_means(scan, *core_borders, spacing)
+    core = _plateau_means(texture, *core_borders, spacing)
     if core.shape[:2] == (y.border.size - 1, x.border.size - 1):
         return core[_run(y.wanted)][:, _run(x.wanted)]
     texels = np.empty((y.border.size - 1, x.border.size - 1, 3), np.uint8)
     texels[core_y, core_x] = core
     for rows in (slice(0, core_y.start), slice(core_y.stop, texels.shape[0])):
-        _fill_skirt(scan, texels, y, x, rows, slice(0, texels.shape[1]))
+        _fill_skirt(texture.texels, texels, y, x, rows, slice(0, texels.shape[1]))
     for columns in (slice(0, core_x.start), slice(core_x.stop, texels.shape[1])):
-        _fill_skirt(scan, texels, y, x, core_y, columns)
+        _fill_skirt(texture.texels, texels, y, x, core_y, columns)
     return texels[_run(y.wanted)][:, _run(x.wanted)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Texture:
+    """A texture, or a strip's own texels of one, and the same at spacings 1, 2, 4, ..., as far as there are."""
+
+    texels: ImageArray
+    pyramid: tuple[ImageArray, ...]
+
+    @classmethod
+    def of(cls, scan: Scan, stride: int) -> _Texture:
+        own = scan.texture[:, ::stride]
+        return cls(own, scan.pyramid if stride == 1 else (own,))
 
 
 class _Cells:
@@ -113,32 +133,36 @@ class _Cells:
         return slice(int(starts[longest]), int(stops[longest]))
 
 
-def _plateau_means(scan: Scan, y: IntArray, x: IntArray, half_spacing: int) -> ImageArray:
+def _plateau_means(texture: _Texture, y: IntArray, x: IntArray, half_spacing: int) -> ImageArray:
     """Means over equal cells whose borders (half texels) are given. (len(y) - 1, len(x) - 1, 3) uint8."""
     rows, columns = y.size - 1, x.size - 1
     if rows < 1 or columns < 1:
         return np.empty((max(rows, 0), max(columns, 0), 3), np.uint8)
     step = half_spacing // 2
-    on_pyramid = half_spacing in (2, 4, 8, 16) and step.bit_length() <= len(scan.pyramid)
-    aligned = not (y[0] % half_spacing or x[0] % half_spacing or scan.spec.texture_width % step)
-    if on_pyramid and aligned and y[-1] <= 2 * scan.spec.texture_height:
-        level = scan.pyramid[step.bit_length() - 1]
+    height, width = texture.texels.shape[:2]
+    on_pyramid = half_spacing in (2, 4, 8, 16) and step.bit_length() <= len(texture.pyramid)
+    aligned = not (y[0] % half_spacing or x[0] % half_spacing or width % step)
+    if on_pyramid and aligned and y[-1] <= 2 * height:
+        level = texture.pyramid[step.bit_length() - 1]
         return _crop(level, int(y[0]) // half_spacing, rows, int(x[0]) // half_spacing, columns)
     even_rows, even_columns = rows + rows % 2, columns + columns % 2  # so that cells of 1.5 texels end on whole ones
     source = _crop(
-        scan.texture, int(y[0]) // 2, even_rows * half_spacing // 2, int(x[0]) // 2, even_columns * half_spacing // 2
-    )
+        texture.texels, int(y[0]) // 2, even_rows * half_spacing // 2,
+        int(x[0]) // 2, even_columns * half_spacing // 2,
+    )  # fmt: skip
     return np.asarray(cv2.resize(source, (even_columns, even_rows), interpolation=cv2.INTER_AREA)[:rows, :columns])
 
 
-def _fill_skirt(scan: Scan, texels: ImageArray, y: _Cells, x: _Cells, rows: slice, columns: slice) -> None:
+def _fill_skirt(
+    texture: ImageArray, texels: ImageArray, y: _Cells, x: _Cells, rows: slice, columns: slice
+) -> None:
     """Mean colour of the cells in a strip, the narrow direction first. Half-texel borders are taken as whole ones."""
     if rows.start >= rows.stop or columns.start >= columns.stop:
         return
     y_border = y.border[rows.start : rows.stop + 1] // 2
     x_border = x.border[columns.start : columns.stop + 1] // 2
     height, width = int(y_border[-1] - y_border[0]), int(x_border[-1] - x_border[0])
-    source = _crop(scan.texture, int(y_border[0]), height, int(x_border[0]), width)
+    source = _crop(texture, int(y_border[0]), height, int(x_border[0]), width)
     if rows.stop - rows.start <= columns.stop - columns.start:
         strip = _column_means(_row_means(source, y_border - y_border[0]), x_border - x_border[0])
     else:

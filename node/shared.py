@@ -49,7 +49,8 @@ QUERY_KEYS = {"u", "v", "window", "texture_db", "range_mm", "max_bytes", "alpha"
 NONE = "-"
 ORIGINAL_URI = "X-Original-URI"
 KEPT = re.compile(r"/v1/scans/([0-9a-f]{32})/(?:coarse|fovea/([0-9a-f]{8})/[0-9.-]+/[0-9.-]+)(?:\?[^#]*)?")
-RANGE_NUMBERS, TEXTURE_NUMBERS = 8, 9
+LATTICE_NUMBERS, RANGE_NUMBERS, TEXTURE_NUMBERS = 7, 8, 9
+URL_PART_MAX = 4096
 
 T = TypeVar("T")
 
@@ -174,8 +175,8 @@ def canonical_path(scan_id: str, epoch: str, coded: tuple[Coded, ...]) -> str:
     for one in coded:
         p = one.parameters
         numbers = [p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y, one.quality]
-        is_range = one.channel is Channel.RANGE
-        parts[one.channel.name.lower()] = ".".join(map(str, numbers if is_range else [*numbers, int(one.codec)]))
+        codec = [] if one.channel is Channel.RANGE else [int(one.codec)]
+        parts[one.channel.name.lower()] = ".".join(map(str, [*numbers, *codec, *(p.listed or ())]))
     return f"/v1/scans/{scan_id}/fovea/{epoch}/{parts['range']}/{parts['texture']}"
 
 
@@ -190,23 +191,28 @@ def body_of(coded: tuple[Coded, ...]) -> bytes:
 def _encode(scan: Scan, view: FirstView, range_part: str, texture_part: str) -> bytes:
     coded = []
     if range_part != NONE:
-        *lattice, quantum = _numbers(range_part, RANGE_NUMBERS)
-        coded.append(code_range_lattice(scan, view.state, _parameters(*lattice), quantum))
+        lattice, (quantum,), listed = _numbers(range_part, RANGE_NUMBERS)
+        coded.append(code_range_lattice(scan, view.state, _parameters(*lattice, listed=listed), quantum))
     if texture_part != NONE:
-        *lattice, quality, codec = _numbers(texture_part, TEXTURE_NUMBERS)
-        coded.append(code_texture_lattice(scan, view.state, _parameters(*lattice), quality, TextureCodec(codec)))
+        lattice, (quality, codec), listed = _numbers(texture_part, TEXTURE_NUMBERS)
+        parameters = _parameters(*lattice, listed=listed)
+        coded.append(code_texture_lattice(scan, view.state, parameters, quality, TextureCodec(codec)))
     return body_of(tuple(one for one in coded if one is not None))
 
 
-def _parameters(p2: int, x: int, y: int, wide: int, high: int, rho_x: int, rho_y: int) -> Parameters:
-    return Parameters(p2, x, y, wide, high, rho_x, rho_y)
+def _parameters(
+    p2: int, x: int, y: int, wide: int, high: int, rho_x: int, rho_y: int, *, listed: tuple[int, ...] | None
+) -> Parameters:
+    return Parameters(p2, x, y, wide, high, rho_x, rho_y, listed)
 
 
-def _numbers(text: str, count: int) -> list[int]:
-    numbers = [int(part) for part in text.split(".") if part.isascii() and part.isdigit() and len(part) <= 10]
-    if len(numbers) != count or ".".join(map(str, numbers)) != text:
-        raise ValueError(f"expected {count} numbers, got {text[:80]!r}")
-    return numbers
+def _numbers(text: str, count: int) -> tuple[list[int], list[int], tuple[int, ...] | None]:
+    """A lattice's seven numbers, what more of the first `count` there is, and behind these the runs listed, if any."""
+    found = text[:URL_PART_MAX].split(".")
+    numbers = [int(part) for part in found if part.isascii() and part.isdigit() and len(part) <= 10]
+    if len(numbers) < count or ".".join(map(str, numbers)) != text:
+        raise ValueError(f"expected {count} numbers, and runs, got {text[:80]!r}")
+    return numbers[:LATTICE_NUMBERS], numbers[LATTICE_NUMBERS:count], tuple(numbers[count:]) or None
 
 
 def _asked(request: web.Request) -> tuple[m.Look, m.CodecName]:

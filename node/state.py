@@ -64,11 +64,10 @@ class ClientState:
         place = np.arange(top, top + high)[:, None], np.arange(left, left + wide)[None, :] % self.error.shape[1]
         row = np.arange(top * RANGE_BLOCK, (top + high) * RANGE_BLOCK)
         column = np.arange(left * RANGE_BLOCK, (left + wide) * RANGE_BLOCK)
-        rows = (row >= region.top) & (row < region.top + region.height)
-        columns = np.packbits((column - region.left) % region.turn < region.width)
+        cells = region.inside(row, column)
         if region.turn % RANGE_BLOCK:
-            columns[:] = 0xFF  # behind a cut block columns are not where they seem: count whole blocks
-        inside = np.where(rows[:, None], columns[None, :], 0).astype(np.uint8)
+            cells |= cells.any(axis=1, keepdims=True)  # behind a cut block columns are not where they seem: count all
+        inside = np.packbits(cells, axis=1)
         known = self.target_steps[place] <= target_steps
         bits = np.where(known.repeat(RANGE_BLOCK, axis=0), self.far[row[:, None], place[1]], 0xFF) & inside
         count = np.bitwise_count(bits).reshape(high, RANGE_BLOCK, wide).sum(axis=1, dtype=np.int64)
@@ -93,16 +92,16 @@ def first_state(scan: Scan, coarse_steps: StepArray) -> ClientState:
 
 
 def block_errors(
-    patch: StepArray, truth: StepArray, heights: IntArray, widths: IntArray, target_steps: float
+    patch: StepArray, truth: StepArray, heights: IntArray, widths: IntArray, target_steps: float, stride: int = 1
 ) -> tuple[StepArray, NDArray[np.uint8]]:
     """Of each block of a rectangle: the largest |patch - truth| where measured, and which cells are beyond the target.
 
-    heights, widths : cells of each row and column of blocks.
+    heights, widths : cells of each row and column of blocks.  stride : how many grid columns each cell stands for.
     Returns (rows, columns) uint16 [steps], and (8 rows, columns) uint8 of bits.
     """
     difference = np.abs(patch.astype(np.int32) - truth)
     difference[truth == VOID] = 0
-    padded = pad_blocks(difference, heights, widths, RANGE_BLOCK)
+    padded = pad_blocks(difference.repeat(stride, axis=1), heights, widths * stride, RANGE_BLOCK)
     rows, columns = heights.size, widths.size
     largest = padded.reshape(rows, RANGE_BLOCK, columns, RANGE_BLOCK).max(axis=(1, 3))
     return largest.astype(np.uint16), np.packbits(padded > target_steps, axis=1)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.codec import LOSSLESS, TextureCodec, decode_texture, encode_texture
-from protocol.grid import FloatArray, ImageArray, IntArray
+from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray
 from protocol.region import Region
 
 QUALITIES = (6, 20, 34, 48, 62)
@@ -102,8 +102,13 @@ class TextureModel:
         """What the blocks that a region touches will take and reach."""
         left, top, wide, high = region.blocks(CELL)
         columns = np.arange(left, left + wide) % self._mse.shape[2]
-        mse = self._mse[:, top : top + high][:, :, columns].mean(axis=(1, 2), dtype=np.float64)
-        tiles = self._share_of_tiles(left * CELL, top * CELL, wide * CELL, high * CELL)
+        touched = region.touched(CELL)
+        if touched.all():
+            mse = self._mse[:, top : top + high][:, :, columns].mean(axis=(1, 2), dtype=np.float64)
+            tiles = self._share_of_tiles(left * CELL, top * CELL, wide * CELL, high * CELL)
+        else:
+            mse = self._mse[:, top : top + high][:, :, columns][:, touched].mean(axis=1, dtype=np.float64)
+            tiles = self._touched_tiles(top, columns, touched)
         size_bytes = (self._bytes * tiles).sum(axis=(1, 2)) * self._bias[codec]
         return Expected(np.log(np.maximum(mse, MSE_MIN)), np.log(np.maximum(size_bytes, 1.0)))
 
@@ -135,6 +140,14 @@ class TextureModel:
             self._bytes[index, row, column] = max(len(payload) - TILE_OVERHEAD_BYTES, 1)
             decoded = decode_texture(payload, TextureCodec.HTJ2K, quality, (tile.shape[0], tile.shape[1]))
             self._mse[(index, *cells)] = _cell_errors(tile, decoded)
+
+    def _touched_tiles(self, top: int, columns: IntArray, touched: BoolArray) -> FloatArray:
+        """How much of each tile some of its cells are, 0..1. touched : of the cells from `top` on, in `columns`."""
+        rows, across = np.nonzero(touched)
+        counts = np.zeros(self._bytes.shape[1:])
+        np.add.at(counts, ((top + rows) * CELL // TILE, columns[across] * CELL // TILE), 1)
+        high, wide = (np.minimum(TILE, size - np.arange(0, size, TILE)) for size in self._shape)
+        return np.asarray(counts * CELL**2 / np.multiply.outer(high, wide))
 
     def _share_of_tiles(self, left: int, top: int, width: int, height: int) -> FloatArray:
         """How much of each tile a rectangle covers, 0..1, cyclic in x."""

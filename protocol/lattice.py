@@ -38,7 +38,8 @@ class ChannelShape:
     """One channel of a scan, as far as lattices and holdings are concerned.
 
     width, height : dense samples.  coarse_width, coarse_height : samples of the first view.  block : side of a block.
-    sphere : rows are directions' polar angles; rings of range near the poles are thinned (protocol.rings).
+    sphere : rows are directions' polar angles; near the poles they hold fewer samples of their own (protocol.rings).
+    stride : of a strip of such rows: how many columns apart these samples stand.
     """
 
     channel: Channel
@@ -47,6 +48,7 @@ class ChannelShape:
     coarse_width: int
     coarse_height: int
     sphere: bool = False
+    stride: int = 1
 
     def __post_init__(self) -> None:
         if not (1 <= self.coarse_width <= self.width and 1 <= self.coarse_height <= self.height):
@@ -56,6 +58,21 @@ class ChannelShape:
     def block(self) -> int:
         """Side of a block: 8 range samples or 16 texels."""
         return RANGE_BLOCK if self.channel is Channel.RANGE else TEXTURE_BLOCK
+
+    @property
+    def own_width(self) -> int:
+        """Samples of its own that a row has."""
+        return self.width // self.stride
+
+    @property
+    def own_block(self) -> int:
+        """How many of them a block is wide."""
+        return self.block // self.stride
+
+    @property
+    def beyond(self) -> int:
+        """How many own samples right of a block its cells hang on: the next one, where there are cells between."""
+        return int(self.stride > 1)
 
     @property
     def blocks(self) -> tuple[int, int]:
@@ -156,10 +173,10 @@ class Lattice:
 @lru_cache(maxsize=64)
 def build_lattice(shape: ChannelShape, parameters: Parameters) -> Lattice:
     """Compute a lattice from what travelled. Raises LatticeError when the parameters describe none."""
-    _check(shape, parameters)
-    x, y = _axis_x(shape, parameters), _axis_y(shape, parameters)
+    check_parameters(shape, parameters)
+    x, y = axis_x(shape, parameters), axis_y(shape, parameters)
     level = np.maximum.outer(level_of_gap(y.gap), level_of_gap(x.gap))
-    return Lattice(shape, parameters, x, y, level, _listed(shape, parameters, x, y))
+    return Lattice(shape, parameters, x, y, level, listed_blocks(shape, parameters, x, y))
 
 
 def level_of_gap(gap: IntArray) -> IntArray:
@@ -198,7 +215,8 @@ def mask_to_runs(mask: BoolArray) -> tuple[int, ...]:
     return tuple(int(n) for n in np.diff(np.concatenate([[0], edges, [mask.size]])))
 
 
-def _check(shape: ChannelShape, p: Parameters) -> None:
+def check_parameters(shape: ChannelShape, p: Parameters) -> None:
+    """Raise LatticeError unless the parameters describe a lattice."""
     rows, columns = shape.blocks
     if p.half_spacing not in shape.half_spacings:
         raise LatticeError(f"spacing {p.spacing} is not one of {[h / 2 for h in shape.half_spacings]}")
@@ -214,8 +232,9 @@ def _check(shape: ChannelShape, p: Parameters) -> None:
         raise LatticeError("a plateau all round must start at block 0 and its spacing divide the width")
 
 
-def _axis_x(shape: ChannelShape, p: Parameters) -> Axis:
-    width, block = shape.width, shape.block
+def axis_x(shape: ChannelShape, p: Parameters) -> Axis:
+    """The x axis, in samples of a row's own."""
+    width, block = shape.own_width, shape.own_block
     columns = shape.blocks[1]
     start = p.block_x * block
     end = p.block_x + p.blocks_wide
@@ -226,10 +245,11 @@ def _axis_x(shape: ChannelShape, p: Parameters) -> Axis:
     steps = _half_steps(shape, p.half_spacing, p.rho_x, width, shape.coarse_width)
     border = _grow_both(plateau, steps, 2 * (width - 1))
     at = _positions(shape, border)
-    return _cover(at, np.arange(at.size), border, _turns(shape, (-1, 0, 1)), _past(shape))
+    return _cover(at, np.arange(at.size), border, _turns(shape, (-1, 0, 1)), shape.beyond)
 
 
-def _axis_y(shape: ChannelShape, p: Parameters) -> Axis:
+def axis_y(shape: ChannelShape, p: Parameters) -> Axis:
+    """The y axis."""
     height, block = shape.height, shape.block
     start, stop = p.block_y * block, min((p.block_y + p.blocks_high) * block, height)
     edge = 2 * height if shape.channel is Channel.TEXTURE else 2 * (height - 1)
@@ -252,9 +272,9 @@ def _plateau(start: int, stop: int, half_spacing: int) -> IntArray:
 
 def _half_steps(shape: ChannelShape, half_spacing: int, rho: int, size: int, coarse: int) -> list[int]:
     """Skirt steps in half samples. Texture cells get a guard first, one more cell of the plateau's spacing, so that
-    the plateau's outermost texels lie between two centres; at spacing 1 they lie on them."""
+    the plateau's outermost texels lie between two centres; at spacing 1 they lie on them, but for cells beyond."""
     steps = [2 * step for step in skirt_steps(half_spacing, rho, max(1, size // coarse), size)]
-    needs_guard = shape.channel is Channel.TEXTURE and half_spacing > 2
+    needs_guard = shape.channel is Channel.TEXTURE and (half_spacing > 2 or shape.beyond > 0)
     return [half_spacing, *steps] if needs_guard else steps
 
 
@@ -284,19 +304,14 @@ def _positions(shape: ChannelShape, border: IntArray) -> IntArray:
 
 
 def _ring(shape: ChannelShape, half_spacing: int) -> Axis:
-    border = np.arange(0, 2 * shape.width + 1, half_spacing, dtype=np.int64)
+    border = np.arange(0, 2 * shape.own_width + 1, half_spacing, dtype=np.int64)
     at = _positions(shape, border)
     if shape.channel is Channel.RANGE:
         at, border = at[:-1], border[:-1]
-    count, turn = at.size, QUARTERS * shape.width
+    count, turn = at.size, QUARTERS * shape.own_width
     sample = np.concatenate([[count - 1], np.arange(count), [0]])
     at = np.concatenate([[at[-1] - turn], at, [at[0] + turn]])
-    return _cover(at, sample, border, _turns(shape, (0,)), _past(shape))
-
-
-def _past(shape: ChannelShape) -> int:
-    """How far a block's stencil reaches to the right: to its last sample, or on a thinned ring to the next block's."""
-    return 0 if shape.sphere and shape.channel is Channel.RANGE else 1
+    return _cover(at, sample, border, _turns(shape, (0,)), shape.beyond)
 
 
 def _repeat_edges(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[IntArray, IntArray]:
@@ -314,24 +329,24 @@ def _repeat_edges(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[
 
 def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) -> tuple[IntArray, IntArray, IntArray]:
     """Blocks of an axis over several turns: index, first and past-last dense position."""
-    size = shape.height if vertical else shape.width
+    size, side = (shape.height, shape.block) if vertical else (shape.own_width, shape.own_block)
     index = np.arange(shape.blocks[0 if vertical else 1])
-    start = index * shape.block
-    stop = np.minimum(start + shape.block, size)
+    start = index * side
+    stop = np.minimum(start + side, size)
     offset = np.repeat(np.asarray(turns, np.int64) * size, index.size)
     return np.tile(index, len(turns)), np.tile(start, len(turns)) + offset, np.tile(stop, len(turns)) + offset
 
 
 def _cover(
-    at: IntArray, sample: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray], short: int = 1
+    at: IntArray, sample: IntArray, border: IntArray, blocks: tuple[IntArray, IntArray, IntArray], beyond: int = 0
 ) -> Axis:
     """Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches.
 
-    short : by how much the stencil ends before the next block.
+    beyond : how many positions past the block the stencil reaches.
     """
     index, start, stop = blocks
     first = np.searchsorted(at, QUARTERS * start, side="right") - 1
-    last = np.searchsorted(at, QUARTERS * (stop - short), side="left")
+    last = np.searchsorted(at, QUARTERS * (stop - 1 + beyond), side="left")
     inside = (first >= 0) & (last < at.size)
     index, start, stop, first, last = (a[inside] for a in (index, start, stop, first, last))
     count = int(sample.max()) + 1
@@ -347,7 +362,8 @@ def _widest(intervals: IntArray, first: IntArray, last: IntArray) -> IntArray:
     return np.maximum.reduceat(touched, bounds)[::2] if first.size else first
 
 
-def _listed(shape: ChannelShape, p: Parameters, x: Axis, y: Axis) -> BoolArray:
+def listed_blocks(shape: ChannelShape, p: Parameters, x: Axis, y: Axis) -> BoolArray:
+    """Which of the blocks covered by two axes may be adopted. (by, bx)"""
     if p.listed is None:
         return np.ones((y.block.size, x.block.size), np.bool_)
     mask = runs_to_mask(p.listed, p.blocks_high * p.blocks_wide).reshape(p.blocks_high, p.blocks_wide)

@@ -21,7 +21,7 @@ from protocol.errors import LatticeError
 from protocol.grid import VOID, BoolArray, FloatArray, ImageArray, IntArray, StepArray
 from protocol.holdings import ChannelHoldings, HashArray, hash_blocks
 from protocol.lattice import QUARTERS, Axis, ChannelShape, Lattice
-from protocol.rings import ring_strides
+from protocol.rings import Cells, widened
 
 Number = TypeVar("Number", bound=np.number[Any])
 BAND_ROWS = 256
@@ -32,11 +32,13 @@ LightArray = NDArray[np.float32]
 class Window:
     """One axis of a selection: the run of covered blocks round the adopted ones, and the samples they need.
 
-    block : (b,) int64 block indices.   size : (b,) int64 dense samples in each.   start : first dense one, not wrapped.
+    Positions are a row's own samples (ChannelShape.stride): all of them but on a sphere, and there, where stride > 1,
+    `beyond` more than the blocks hold.
+
+    block : (b,) int64 block indices.   size : (b,) int64 positions in each.   start : first position, not wrapped.
     sample : (n,) int64 the lattice's samples that travel, ascending.
-    low, high : (cells,) int64 for each dense position, the two transmitted samples beside it ...
+    low, high : (cells,) int64 for each position, the two transmitted samples beside it ...
     part, whole : (cells,) int64 ... and its place between them, part / whole.
-    at, local : (m,) int64 the stencil's positions, ascending, in quarter samples, and which of `sample` stands at each.
     """
 
     block: IntArray
@@ -47,14 +49,15 @@ class Window:
     high: IntArray
     part: IntArray
     whole: IntArray
-    at: IntArray
-    local: IntArray
+    beyond: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
     """What one refinement of a lattice carries. The payload is an image: y.sample by x.sample.
 
+    Its rectangle is all cells of the windows' blocks; a patch of it has rows and columns of own samples, and where
+    cells lie between these, one column more.
     adopted : (by, bx) bool over the windows' blocks; the first and last row and column each hold an adopted block.
     """
 
@@ -74,8 +77,15 @@ class Selection:
         return self.y.sample.size * self.x.sample.size
 
     def adopted_cells(self) -> BoolArray:
-        """Which cells of the windows' rectangle are adopted. (rows, columns) bool."""
+        """Which own samples of the windows' rectangle are adopted. (rows, columns) bool, without the column more."""
         return np.repeat(np.repeat(self.adopted, self.y.size, axis=0), self.x.size, axis=1)
+
+    def seen_cells(self) -> BoolArray:
+        """The same with those that adopted cells hang on, of a patch. (rows, columns) bool."""
+        adopted = self.adopted_cells()
+        if not self.x.beyond:
+            return adopted
+        return np.pad(adopted, ((0, 0), (0, 1))) | np.pad(adopted, ((0, 0), (1, 0)))
 
     def adopted_blocks(self) -> IntArray:
         """Flat indices of the adopted blocks. (n,) int64, in the windows' row order."""
@@ -83,8 +93,8 @@ class Selection:
         return self.y.block[rows] * self.lattice.shape.blocks[1] + self.x.block[columns]
 
     def spans(self) -> Iterator[tuple[slice, slice, slice]]:
-        """Where the windows' rectangle lies: (dense rows, dense columns, columns of the rectangle), cut at the seam."""
-        width = self.lattice.shape.width
+        """Where a patch lies: (rows, own columns of the grid, columns of the patch), cut at the seam."""
+        width = self.lattice.shape.own_width
         rows = slice(self.y.start, self.y.start + self.y.low.size)
         done = 0
         while done < self.x.low.size:
@@ -104,17 +114,17 @@ def select(lattice: Lattice, held: ChannelHoldings, rank: int) -> tuple[Selectio
     if not rows.size:
         return None
     y = _window(lattice.y, int(rows[0]), int(rows[-1]) + 1)
-    x = _window(lattice.x, int(columns[0]), int(columns[-1]) + 1)
+    x = _window(lattice.x, int(columns[0]), int(columns[-1]) + 1, lattice.shape.beyond)
     core = adopted[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     return Selection(lattice, y, x, core), adopted
 
 
-def _window(axis: Axis, begin: int, end: int) -> Window:
+def _window(axis: Axis, begin: int, end: int, beyond: int = 0) -> Window:
     begin_at, end_at = int(axis.first[begin]), int(axis.last[end - 1]) + 1
     at = axis.at[begin_at:end_at]
     sample, local = _numbered(axis.sample[begin_at:end_at])
     start = int(axis.start[begin])
-    position = QUARTERS * np.arange(start, int(axis.stop[end - 1]), dtype=np.int64)
+    position = QUARTERS * np.arange(start, int(axis.stop[end - 1]) + beyond, dtype=np.int64)
     if at.size == 1:
         zero = np.zeros(position.size, np.int64)
         low, high, part, whole = zero, zero, zero, np.ones_like(zero)
@@ -123,7 +133,7 @@ def _window(axis: Axis, begin: int, end: int) -> Window:
         low, high = local[index], local[index + 1]
         part, whole = position - at[index], at[index + 1] - at[index]
     size = axis.stop[begin:end] - axis.start[begin:end]
-    return Window(axis.block[begin:end], size, start, sample, low, high, part, whole, at, local)
+    return Window(axis.block[begin:end], size, start, sample, low, high, part, whole, beyond)
 
 
 def _numbered(sample: IntArray) -> tuple[IntArray, IntArray]:
@@ -145,57 +155,6 @@ def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
     _check_samples(selection, range_steps.shape)
     columns = _blend(range_steps.T.astype(np.float64), x).T
     return _round_ratio(_blend(columns, y), np.multiply.outer(y.whole.astype(np.float64), x.whole))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ring:
-    """How the transmitted samples of a thinned row hang on the kept ones: (n,) int64 each, kept where part is 0.
-
-    row : which of the selection's sample rows it is about.
-    """
-
-    row: IntArray
-    low: IntArray
-    high: IntArray
-    part: IntArray
-    whole: IntArray
-
-
-def thinned_rings(selection: Selection) -> list[Ring]:
-    """The rows of a spherical selection that keep fewer samples than they have, by how few (REQUIREMENTS F-17).
-
-    In a row of stride s the first lattice sample of each s dense columns is kept, and the outermost ones.
-    """
-    shape, window = selection.lattice.shape, selection.x
-    if not shape.sphere:
-        return []
-    rows = selection.lattice.y.border[selection.y.sample] // 2
-    stride = ring_strides(shape.width, shape.height, selection.lattice.parameters.half_spacing)[rows]
-    rings = []
-    own = max(selection.lattice.parameters.half_spacing // 2, 1)
-    for s in np.unique(stride[stride > own]).tolist():
-        cell = window.at // (QUARTERS * s)
-        kept = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1) != 0)
-        kept = np.union1d(kept, [window.at.size - 1])
-        left = np.searchsorted(kept, np.arange(window.at.size), side="right") - 1
-        right = np.minimum(left + 1, kept.size - 1)
-        low, high = kept[left], kept[right]
-        _, first = np.unique(window.local, return_index=True)
-        whole = np.maximum(window.at[high] - window.at[low], 1)
-        part = window.at - window.at[low]
-        chosen = (window.local[low], window.local[high], part, whole)
-        rings.append(Ring(np.flatnonzero(stride == s), *(values[first] for values in chosen)))
-    return rings
-
-
-def fill_rings(selection: Selection, range_steps: StepArray) -> StepArray:
-    """Transmitted samples with those between kept ones interpolated, (2 n + d) // (2 d). sample_shape uint16."""
-    filled = range_steps.copy()
-    for ring in thinned_rings(selection):
-        rows = range_steps[ring.row].astype(np.int64)
-        mixed = rows[:, ring.low] * (ring.whole - ring.part) + rows[:, ring.high] * ring.part
-        filled[ring.row] = (2 * mixed + ring.whole) // (2 * ring.whole)
-    return filled
 
 
 def _blend(samples: FloatArray, window: Window) -> FloatArray:
@@ -240,27 +199,33 @@ def _between(samples: ImageArray | LightArray, low: IntArray, high: IntArray, pa
     return start
 
 
-def paste(dense: StepArray | ImageArray, patch: StepArray | ImageArray, selection: Selection) -> None:
+def paste(dense: Cells, patch: Cells, selection: Selection) -> None:
     """Overwrite the adopted blocks of a dense array with a patch; every other cell stays as it is."""
-    where = selection.adopted_cells().view(np.uint8)
+    stride = selection.lattice.shape.stride
+    wide = widened(patch, stride)
+    where = np.repeat(selection.adopted_cells().view(np.uint8), stride, axis=1)
     whole = bool(selection.adopted.all())
     for rows, columns, source in selection.spans():
+        last = min(source.stop, where.shape[1] // stride)
+        to = slice(columns.start * stride, (columns.start + last - source.start) * stride)
+        of = slice(source.start * stride, last * stride)
         if whole:
-            dense[rows, columns] = patch[:, source]
+            dense[rows, to] = wide[:, of]
         else:
-            cv2.copyTo(patch[:, source], where[:, source], dense[rows, columns])
+            cv2.copyTo(wide[:, of], where[:, of], dense[rows, to])
 
 
 def cut(dense: StepArray | ImageArray, selection: Selection) -> StepArray | ImageArray:
-    """The windows' rectangle of a dense array, the seam joined. (rows, columns, ...) copy."""
-    return np.concatenate([dense[rows, columns] for rows, columns, _ in selection.spans()], axis=1)
+    """What a patch would be if it were the dense array's own, the seam joined. (rows, columns, ...) copy."""
+    own = dense[:, :: selection.lattice.shape.stride]
+    return np.concatenate([own[rows, columns] for rows, columns, _ in selection.spans()], axis=1)
 
 
 def content_hashes(patch: StepArray, selection: Selection) -> HashArray:
     """Hashes of the adopted blocks of a range patch, in the order of Selection.adopted_blocks. (n,) uint32."""
-    side = selection.lattice.shape.block
+    side, stride = selection.lattice.shape.block, selection.lattice.shape.stride
     rows, columns = selection.adopted.shape
-    patch = pad_blocks(patch, selection.y.size, selection.x.size, side)
+    patch = pad_blocks(widened(patch, stride), selection.y.size, selection.x.size * stride, side)
     cells = patch.reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
     return hash_blocks(cells[selection.adopted])
 

@@ -1,4 +1,4 @@
-"""The part of a grid that a click is about."""
+"""The part of a grid that a click is about: a rectangle, or on a sphere a cap."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocol.grid import IntArray
+from protocol.grid import BoolArray, FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Region:
     """A rectangle of a grid, cyclic in x: columns left..left+width (not wrapped), rows top..top+height."""
 
@@ -30,15 +30,69 @@ class Region:
         """Grid rows."""
         return slice(self.top, self.top + self.height)
 
+    @property
+    def area(self) -> float:
+        """How many samples it holds, at the density of the middle."""
+        return self.width * self.height
+
+    def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
+        """Which of rows x columns (not wrapped) lie in it. (rows, columns) bool"""
+        down = (rows >= self.top) & (rows < self.top + self.height)
+        return np.logical_and.outer(down, (columns - self.left) % self.turn < self.width)
+
     def blocks(self, side: int) -> tuple[int, int, int, int]:
-        """The blocks it touches: (first column, first row, columns, rows); all round when it meets itself."""
-        columns = -(-self.turn // side)
-        first, last = self.left % self.turn // side, (self.left + self.width - 1) % self.turn // side
-        wide = (last - first) % columns + 1
-        if self.width > self.turn - side or (self.width > side and wide == 1):
-            first, wide = 0, columns
+        """Blocks of the rectangle round it: first column, first row, columns, rows; all round when it meets itself."""
+        first, wide = blocks_touched(np.array([self.left]), np.array([self.width]), side, self.turn)
         top, bottom = self.top // side, (self.top + self.height - 1) // side
-        return first, top, wide, bottom - top + 1
+        return int(first[0]), top, int(wide[0]), bottom - top + 1
+
+    def touched(self, side: int) -> BoolArray:
+        """Which blocks of that rectangle it touches. (rows, columns) bool"""
+        _, _, wide, high = self.blocks(side)
+        return np.ones((high, wide), np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class Cap(Region):
+    """A round part of a sphere; the rectangle is the smallest round it.
+
+    row_left, row_width : (height,) int64 its columns in each of its rows, cyclic and not wrapped, at least one.
+    row_share : (height,) float64 how wide columns are in each row, 1 on the equator.
+    """
+
+    row_left: IntArray
+    row_width: IntArray
+    row_share: FloatArray
+
+    @property
+    def area(self) -> float:
+        """How many samples it holds, at the density of the equator."""
+        return float(self.row_width @ self.row_share)
+
+    def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
+        """Which of rows x columns (not wrapped) lie in it. (rows, columns) bool"""
+        row = np.clip(rows - self.top, 0, self.height - 1)
+        width = np.where((rows >= self.top) & (rows < self.top + self.height), self.row_width[row], 0)
+        away = (columns - self.row_left[row][:, None]) % self.turn
+        return np.asarray(away < width[:, None])
+
+    def touched(self, side: int) -> BoolArray:
+        """Which blocks of the rectangle round it it touches. (rows, columns) bool"""
+        left, top, wide, high = self.blocks(side)
+        first, count = blocks_touched(self.row_left, self.row_width, side, self.turn)
+        columns = -(-self.turn // side)
+        crosses = (left + np.arange(wide) - first[:, None]) % columns < count[:, None]
+        starts = np.maximum(side * (top + np.arange(high)) - self.top, 0)
+        return np.asarray(np.logical_or.reduceat(crosses, starts, axis=0))
+
+
+def blocks_touched(left: IntArray, width: IntArray, side: int, turn: int) -> tuple[IntArray, IntArray]:
+    """The block columns that runs of columns (n,) touch: the first, how many; all from 0 where a run meets itself."""
+    columns = -(-turn // side)
+    first, last = left % turn // side, (left + width - 1) % turn // side
+    wide = (last - first) % columns + 1
+    meets = (width > turn - side) | ((width > side) & (wide == 1))
+    return np.where(meets, 0, first), np.where(meets, columns, wide)
 
 
 def region_round(u: float, v: float, share: float, width: int, height: int) -> Region:

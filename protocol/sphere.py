@@ -21,7 +21,7 @@ from protocol.errors import LatticeError
 from protocol.fovea import view_to_radius
 from protocol.grid import FloatArray, GridSpec, IntArray, StepArray
 from protocol.lattice import RHO_MAX, RHO_ONE
-from protocol.region import Region, region_round
+from protocol.region import Cap, Region, region_round
 
 ROUNDING_DIGITS = 9  # of directions that are compared, in decimals of a radian
 PLACE_DIGITS = 6  # of a place on the dense grid before it is snapped, in decimals of a sample: 1e-9 rad and less
@@ -121,22 +121,27 @@ class DirectionGrid:
         return row[first], column[first]
 
 
-def cap_region(u: float, v: float, share: float, width: int, height: int) -> Region:
-    """The rectangle of a direction grid round a cap: `share` of the sphere, centred on the clicked direction.
+def cap_region(u: float, v: float, share: float, width: int, height: int) -> Cap:
+    """The cap of a click on a direction grid: `share` of the sphere, centred on the very direction.
 
-    A cap that holds a pole takes all columns. Odd sides elsewhere, as region_round has them.
+    It holds the samples whose centres lie in it, and always the clicked one.
     """
     radius_rad = math.acos(max(1 - 2 * share, -1.0))
-    row, column = int(v * height), int(u * width)
-    polar_rad = math.pi * (row + 0.5) / height
-    reach = math.floor(radius_rad * height / math.pi)
-    top, bottom = max(row - reach, 0), min(row + reach, height - 1)
-    if polar_rad <= radius_rad or math.pi - polar_rad <= radius_rad:
-        return Region(0, top, width, bottom - top + 1, width)
-    sine = math.sin(radius_rad) / math.sin(polar_rad)
-    half = math.asin(min(sine, 1.0)) if radius_rad < math.pi / 2 else math.pi
-    wide = min(2 * math.floor(half * width / (2 * math.pi)) + 1, width)
-    return Region(column - wide // 2, top, wide, bottom - top + 1, width)
+    polar_rad, column, row = math.pi * v, int(u * width), int(v * height)
+    theta_v = np.pi * (np.arange(height) + 0.5) / height
+    nearest = np.abs(theta_v - polar_rad)
+    farthest = np.minimum(theta_v + polar_rad, 2 * np.pi - theta_v - polar_rad)
+    rows = np.union1d(np.flatnonzero(nearest <= radius_rad), [row])
+    theta_v, farthest = theta_v[rows], farthest[rows]
+    sines = np.sin(theta_v) * max(math.sin(polar_rad), 1e-12)
+    cosine = (math.cos(radius_rad) - np.cos(theta_v) * math.cos(polar_rad)) / sines
+    half = np.where(farthest <= radius_rad, np.pi, np.arccos(np.clip(cosine, -1, 1))) * width / (2 * np.pi)
+    left = np.ceil(u * width - half - 0.5).astype(np.int64)
+    wide = np.minimum(np.floor(u * width + half - 0.5).astype(np.int64) - left + 1, width)
+    left, wide = np.where(wide < 1, column, left), np.maximum(wide, 1)
+    widest = int((left + wide).max() - left.min())
+    bounds = (0, width) if widest >= width else (int(left.min()), widest)
+    return Cap(bounds[0], int(rows[0]), bounds[1], rows.size, width, left, wide, np.sin(theta_v))
 
 
 def region_on(spec: GridSpec, u: float, v: float, share: float, width: int, height: int) -> Region:

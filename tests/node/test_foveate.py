@@ -208,7 +208,9 @@ def test_alpha_widens_the_skirt_and_scale_the_window(scan: Scan, view: FirstView
     soft = plan_update(scan, view.state, Look(1, 0.5, 0.5, alpha=0.05), "htj2k")
     wide = plan_update(scan, view.state, Look(1, 0.5, 0.5, scale=0.5), "htj2k")
     assert soft.coded[0].parameters.rho_x < narrow.coded[0].parameters.rho_x
-    assert sum(c.adopted.sum() for c in soft.coded) > sum(c.adopted.sum() for c in narrow.coded)
+    assert sum(p.strip.adopted.sum() for c in soft.coded for p in c.parts) > sum(
+        p.strip.adopted.sum() for c in narrow.coded for p in c.parts
+    )
     assert wide.coded[0].parameters.blocks_wide > 1.5 * narrow.coded[0].parameters.blocks_wide
 
 

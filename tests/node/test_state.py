@@ -67,7 +67,8 @@ def test_cells_beyond_are_counted_as_they_are(scan: Scan) -> None:
     update = plan_update(scan, first, look, "htj2k").settled()
     (coded,) = update.coded
     region = region_round(0.5, 0.5, 0.02, scan.spec.width, scan.spec.height)
-    patch, selection = client_range(scan, coded), coded.selection
+    (part,) = coded.parts
+    patch, selection = client_range(scan, part), part.selection
     dense = np.array(scan.range_steps)
     paste(dense, patch, selection)
     far = np.abs(dense.astype(int) - scan.range_steps) > 0.02 / scan.spec.step_mm
