@@ -19,19 +19,20 @@ class Attempts:
 
     def is_locked(self, address: str, now_s: float) -> bool:
         """Whether an address has failed too often."""
-        failures = self._failures.get(_place(address))
+        failures = self._failures.get(place_of_address(address))
         return failures is not None and len(failures) == self._limit and now_s - failures[0] < self._within_s
 
     def failed(self, address: str, now_s: float) -> None:
         """Count a failure."""
-        place = _place(address)
+        place = place_of_address(address)
         self._failures.setdefault(place, deque(maxlen=self._limit)).append(now_s)
         self._failures.move_to_end(place)
         while len(self._failures) > ADDRESSES_MAX:
             self._failures.popitem(last=False)
 
 
-def _place(address: str) -> str:
+def place_of_address(address: str) -> str:
+    """What an address counts as: all that one subscriber has of IPv6 are one."""
     try:
         parsed = ip_address(address.partition("%")[0])
     except ValueError:

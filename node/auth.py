@@ -124,7 +124,9 @@ class Auth:
         address, now_s = request.remote or "", time.monotonic()
         if self._wrong.is_locked(address, now_s):
             self._refused(Who(NOBODY.name, "", address), "locked", "too many wrong tokens")
-            raise web.HTTPTooManyRequests(text="too many wrong tokens: wait a minute")
+            raise web.HTTPTooManyRequests(
+                text="too many wrong tokens: wait a minute", headers={"Retry-After": f"{WITHIN_S:.0f}"}
+            )
         self._wrong.failed(address, now_s)
         log.warning("a wrong or revoked token from %s", address)
         self._refused(Who(NOBODY.name, "", address), "wrong token", "")

@@ -15,11 +15,12 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from functools import partial
 
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
 from node.audit import Audit, Who
 from node.auth import Login
 from node.bound import Bound, updated
+from node.bucket import Bucket
 from node.classic_planner import ClassicUpdate
 from node.exhibits import Exhibits
 from node.foveate import Update
@@ -38,8 +39,11 @@ HELLO_S = 10.0
 ACK_S = 60.0
 CLOSE_S = 2.0
 QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
-CLOSE_PROTOCOL_ERROR = 1002
 CLOSE_REASON_MAX = 120  # of 123 bytes
+
+
+class _TooMany(RemoteWireError):
+    """A client says more than messages_s allow."""
 
 
 class Connection:
@@ -55,6 +59,7 @@ class Connection:
         live: Live,
         info: m.ServerInfo,
         cold_start_bytes_s: float,
+        messages_s: float,
     ) -> None:
         self._socket = socket
         self.login = login
@@ -67,6 +72,7 @@ class Connection:
         self._info = info
         self._session = Session(Role.NODE)
         self._rate = RateControl(cold_start_bytes_s)
+        self._messages = Bucket(messages_s, time.monotonic())
         self._codecs: tuple[m.CodecName, ...] = ("htj2k",)
         self._geometries: tuple[Geometry, ...] = ()
         self._bound: Bound | None = None
@@ -90,8 +96,10 @@ class Connection:
                 await self._read()
                 for sender in senders:
                     sender.cancel()
+        except* _TooMany as errors:
+            await self._turn_away(str(errors.exceptions[0]), WSCloseCode.POLICY_VIOLATION)
         except* RemoteWireError as errors:
-            await self._turn_away(str(errors.exceptions[0]))
+            await self._turn_away(str(errors.exceptions[0]), WSCloseCode.PROTOCOL_ERROR)
         except* (ConnectionError, TimeoutError):
             pass
 
@@ -109,11 +117,11 @@ class Connection:
         """There is news of the running sweep."""
         self._live_news.set()
 
-    async def close(self, reason: str) -> None:
+    async def close(self, reason: str, code: WSCloseCode) -> None:
         """Say goodbye and end the stream."""
         if self._session.phase is Phase.READY:
             await self._send(m.Goodbye(reason))
-        await self._socket.close(message=_cut(reason))
+        await self._socket.close(code=code, message=_cut(reason))
 
     # -- reading ---------------------------------------------------------------------------------------------------
 
@@ -166,7 +174,7 @@ class Connection:
 
     async def _receive(self) -> m.Message | None:
         """The next message, or None when the stream has ended. Raises RemoteWireError."""
-        frame = await self._socket.receive()
+        frame = await self._next_frame()
         if frame.type is WSMsgType.TEXT:
             said = self._session.receive(frame.data)
             return said if isinstance(said, m.Message) else None
@@ -175,6 +183,17 @@ class Connection:
         if frame.type is WSMsgType.ERROR:
             raise RemoteWireError(f"bad frame: {self._socket.exception()}")
         return None
+
+    async def _next_frame(self) -> WSMessage:
+        """The next frame that is more than a sign of life; those count all the same. Raises RemoteWireError."""
+        while True:
+            frame = await self._socket.receive()
+            if self._messages.take(time.monotonic()):
+                raise _TooMany("too many messages: a client has no use for so many")
+            if frame.type is WSMsgType.PING:
+                await self._socket.pong(frame.data)
+            elif frame.type is not WSMsgType.PONG:
+                return frame
 
     async def _take_look(self, look: m.Look) -> None:
         if self._look is not None:
@@ -330,12 +349,12 @@ class Connection:
         next_seq = self._bound.next_seq if self._bound else 0
         return m.Updated(look.request, next_seq, "superseded")
 
-    async def _turn_away(self, why: str) -> None:
+    async def _turn_away(self, why: str, code: WSCloseCode) -> None:
         log.warning("stream ended: %s", why)
         if not self._socket.closed:
             with suppress(TimeoutError):  # one that does not read either
                 async with asyncio.timeout(CLOSE_S):
-                    await self._socket.close(code=CLOSE_PROTOCOL_ERROR, message=_cut(why))
+                    await self._socket.close(code=code, message=_cut(why))
 
 
 @asynccontextmanager

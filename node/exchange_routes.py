@@ -29,6 +29,7 @@ from protocol.errors import LibraryError
 IMPORT_BYTES_MAX = 1 << 29
 ARRAY_BYTES_MAX = 1 << 28
 EXPORTS_MAX = 2
+SLOWEST_BYTES_S = 16384  # who sends slower for long keeps the one place for imports from others
 FORMATS = "|".join(suffix.removeprefix(".").replace(".", r"\.") for suffix in MEDIA_TYPES)
 
 
@@ -81,7 +82,7 @@ class ExchangeRoutes:
 
 def _check_free(places: asyncio.Semaphore) -> None:
     if places.locked():
-        raise web.HTTPServiceUnavailable(text="busy with other files: try again later")
+        raise web.HTTPServiceUnavailable(text="busy with other files: try again later", headers={"Retry-After": "5"})
 
 
 def _write(scan: Scan, suffix: str, file: BinaryIO) -> None:
@@ -100,10 +101,11 @@ def _write(scan: Scan, suffix: str, file: BinaryIO) -> None:
 async def _receive(request: web.Request, file: BinaryIO) -> None:
     """The whole body into a file. Raises an HTTP error for one that is too long, stalls, or ends early."""
     _check_length(request.content_length or 0)
-    received = 0
+    received, begun_s = 0, time.monotonic()
     try:
         while True:
-            async with asyncio.timeout(STALL_S):
+            patience_s = STALL_S + received / SLOWEST_BYTES_S - (time.monotonic() - begun_s)
+            async with asyncio.timeout(min(STALL_S, patience_s)):
                 chunk = await request.content.read(CHUNK_BYTES)
             if not chunk:
                 break
@@ -111,7 +113,7 @@ async def _receive(request: web.Request, file: BinaryIO) -> None:
             _check_length(received)
             await asyncio.to_thread(file.write, chunk)
     except TimeoutError:
-        raise web.HTTPRequestTimeout(text=f"nothing came for {STALL_S:g} s") from None
+        raise web.HTTPRequestTimeout(text=f"nothing came for {STALL_S:g} s, or hardly anything for longer") from None
     except (ClientError, web.RequestPayloadError) as problem:
         raise web.HTTPBadRequest(text=f"the upload ended early: {problem}") from problem
     except OSError as problem:

@@ -114,7 +114,9 @@ class PairingRoutes:
         if self._failures.is_locked(request.remote or "", time.monotonic()):
             log.warning("pairing: %s is locked", request.remote)
             self._refused(asker(request), "locked", "too many wrong codes")
-            return self._show(LOCKED, 429) if by_form else _refusal(429, LOCKED)
+            locked = self._show(LOCKED, 429) if by_form else _refusal(429, LOCKED)
+            locked.headers["Retry-After"] = f"{WITHIN_S:.0f}"
+            return locked
         return await (self._pair_browser(request, access) if by_form else self._pair_client(request, access, tls, body))
 
     async def _pair_client(self, request: web.Request, access: Access, tls: Tls, body: bytes) -> web.Response:

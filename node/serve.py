@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import cast
 
 import msgspec
-from aiohttp import web
+from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler
 
 from node.access import Access
@@ -24,6 +24,7 @@ from node.derive import Derivation
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
+from node.gate import Gate
 from node.health import Health, examine_health
 from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
@@ -49,6 +50,7 @@ ACCESS_S = 0.5  # between looks at what other processes changed of tokens and ce
 RENEW_S = 3600.0  # between looks at the certificate
 REQUESTS_S = 1.0  # that requests in work get to end when the node stops
 ANSWERED = web.RequestKey("answered", bool)  # the head of the answer is made
+KEPT_HEADERS = ("Allow", "Retry-After")  # of an error that is put in our words
 SECURITY_HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -87,7 +89,8 @@ class NodeServer:
         self._shared = SharedFoveae(exhibits, shared_cache=c.shared_cache, is_open=c.insecure)
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._hanging_up: set[asyncio.Task[None]] = set()
-        middlewares = [believe(c.trusted_proxies), _explain, self._auth.admit]
+        self._gate = Gate(config.limits, is_open=c.insecure, proxies=c.trusted_proxies)
+        middlewares = [believe(c.trusted_proxies), _explain, self._gate.admit, self._auth.admit]
         self._app = web.Application(middlewares=middlewares, client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.extend((_harden, audit_routes.witness))
         self._app.on_cleanup.append(self._close_audit)
@@ -114,21 +117,21 @@ class NodeServer:
     async def start(self) -> tuple[str, int]:
         """Begin to listen. Returns the address bound. Raises OSError when it cannot be."""
         await self._runner.setup()
-        context = self._tls.context if self._tls else None
-        site = web.TCPSite(self._runner, self._config.server.host, self._config.server.port, ssl_context=context)
-        await site.start()
+        server, context = self._config.server, self._tls.context if self._tls else None
+        host, port = await self._gate.open(self._runner, server.host, server.port, context)
         self._watching = asyncio.create_task(self._watch_access())
         self.audit.note("started", NODE, what=self._info.version)
-        host, port = self._runner.addresses[0][:2]
-        return str(host), int(port)
+        return host, port
 
     async def stop(self) -> None:
         """Tell every client, hang up on those that do not listen, then stop listening."""
         self._is_stopping = True
         self._watching.cancel()
-        goodbyes = [asyncio.ensure_future(connection.close("the node is stopping")) for connection in self._connections]
+        why = "the node is stopping", WSCloseCode.GOING_AWAY
+        goodbyes = [asyncio.ensure_future(connection.close(*why)) for connection in self._connections]
         if goodbyes:
             await asyncio.wait(goodbyes, timeout=GOODBYE_S)
+        await self._gate.close()
         for line in self._connections.values():
             line.abort()
         await self.derivation.stop()
@@ -161,7 +164,7 @@ class NodeServer:
         log.warning("ended a stream whose login was revoked")
         try:
             async with asyncio.timeout(GOODBYE_S):
-                await connection.close("the login was revoked")
+                await connection.close("the login was revoked", WSCloseCode.POLICY_VIOLATION)
         except TimeoutError:
             line.abort()
 
@@ -254,20 +257,21 @@ class NodeServer:
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         if len(self._connections) >= self._config.server.max_clients:
             there = f"{len(self._connections)} clients are there"
-            raise web.HTTPServiceUnavailable(text=f"{there}, all that server.max_clients allows: try again later")
+            text = f"{there}, all that server.max_clients allows: try again later"
+            raise web.HTTPServiceUnavailable(text=text, headers={"Retry-After": "10"})
         stream = web.WebSocketResponse(
             protocols=(m.PROTOCOL,), max_msg_size=m.TEXT_MAX, heartbeat=HEARTBEAT_S, compress=False,
-            writer_limit=WRITE_LIMIT_BYTES,
+            writer_limit=WRITE_LIMIT_BYTES, autoping=False,
         )  # fmt: skip
         await stream.prepare(request)
         line = request.transport
         if line is None:  # gone again already
             return stream
         _bound_buffers(line)
-        cold_start = self._config.planner.cold_start_bytes_s
         connection = Connection(
-            stream, request[LOGIN], self.audit, request.remote or "", self._exhibits, self._live, self._info, cold_start
-        )
+            stream, request[LOGIN], self.audit, request.remote or "", self._exhibits, self._live, self._info,
+            self._config.planner.cold_start_bytes_s, self._config.limits.messages_s,
+        )  # fmt: skip
         self._connections[connection] = line
         try:
             await connection.run()
@@ -323,8 +327,7 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
         if error.status < 400:
             raise
         refusal = _refusal(error.status, error.reason.lower(), _what(request, error))
-        if "Allow" in error.headers:
-            refusal.headers["Allow"] = error.headers["Allow"]
+        refusal.headers.update({name: error.headers[name] for name in KEPT_HEADERS if name in error.headers})
         if error.status == 401:
             refusal.headers.update(CHALLENGE)
         return refusal
