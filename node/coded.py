@@ -78,7 +78,7 @@ class Coded:
     @property
     def wire_bytes(self) -> int:
         """What it takes on the wire, carrier included."""
-        return wire_overhead(self.parameters) + len(self.mask) + len(self.payload)
+        return framed(message_overhead(self.parameters) + len(self.mask) + len(self.payload))
 
     def refinement(self, epoch: int, seq: int, look: int) -> Refinement:
         """The wire record."""
@@ -93,9 +93,14 @@ class Coded:
             state.holdings.channels[self.channel].adopt(strip.selection.lattice, strip.adopted, self.rank)
 
 
-def wire_overhead(parameters: Parameters) -> int:
-    """Bytes of a refinement apart from its mask and payload, carrier included."""
-    return FRAME_BYTES + HEADER.size + CRC.size + len(pack_parameters(parameters))
+def message_overhead(parameters: Parameters) -> int:
+    """Bytes of a refinement apart from its mask and payload."""
+    return HEADER.size + CRC.size + len(pack_parameters(parameters))
+
+
+def framed(message_bytes: int) -> int:
+    """What a message takes on a WebSocket, its frame's header included."""
+    return message_bytes + (2 if message_bytes < 126 else 4 if message_bytes < 1 << 16 else FRAME_BYTES)
 
 
 def rho_of(s: float | None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from node.coded import Coded
@@ -10,10 +11,28 @@ from node.texture_model import MSE_MIN, Expected
 
 MARGIN = 0.98  # of the squared error allowed: what is aimed at
 OVERSHOOT_DB = 0.45  # a result so little above the target is not worth another encode: a step of quality is 0.35 dB
-FILL = 0.95  # of the bytes there are: less is worth one more encode
+FILL = 0.88  # of the bytes aimed at: range takes what is left, so only less than this is worth one more encode
 TRIES = 2  # tries spent on saving or filling bytes; only to reach the target or to fit are there more
 TRIES_MAX = 8
 TRIES_MAX_LIMITED = 3
+
+
+class Superseded(Exception):
+    """A newer look has come: what is planned is not wanted any more."""
+
+
+class Encodes:
+    """Counts the images coded for an update. superseded : asked before each; when true, Superseded is raised."""
+
+    def __init__(self, superseded: Callable[[], bool]) -> None:
+        self._superseded = superseded
+        self.count = 0
+
+    def add(self) -> None:
+        """One more is about to be coded."""
+        if self._superseded():
+            raise Superseded
+        self.count += 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,16 +45,23 @@ class Point:
 
 
 class QualitySearch:
-    """Looks for the lowest quality whose squared error is at most target_mse, within limit_bytes on the wire.
+    """Looks for the lowest quality whose squared error is at most target_mse, within a limit.
 
+    aim_bytes, limit_bytes : payload to aim at, and the most it may be.
     expected : what qualities take and reach, by the scan's model.  lowest, highest : the codec's qualities.
     """
 
     def __init__(
-        self, target_mse: float, limit_bytes: float, expected: Expected, lowest: int, highest: int
+        self,
+        target_mse: float,
+        aim_bytes: float,
+        limit_bytes: float,
+        expected: Expected,
+        lowest: int,
+        highest: int,
     ) -> None:
         self._target = target_mse
-        self._limit = limit_bytes
+        self._aim_bytes, self._limit = aim_bytes, limit_bytes
         self._expected = expected
         self._lowest, self._highest = lowest, highest
         self._points: list[Point] = []
@@ -54,20 +80,20 @@ class QualitySearch:
 
     def fits(self, coded: Coded) -> bool:
         """Whether a try is within the bytes there are."""
-        return coded.wire_bytes <= self._limit
+        return len(coded.payload) <= self._limit
 
     def measured(self, point: Point) -> None:
         """A try fitted and was measured."""
         self._points.append(point)
         reached = point.mse <= self._target
         spared = 10 * math.log10(self._target / max(point.mse, 1e-9)) if reached else 0.0
-        filled = point.coded.wire_bytes >= FILL * self._limit
+        filled = len(point.coded.payload) >= FILL * self._aim_bytes
         done = spared <= OVERSHOOT_DB if reached else filled and self.limited
         if done or ((reached or self.limited) and len(self._tried) >= TRIES):
             self._next = None
             return
         worse = max(point.mse, MSE_MIN) / self._expected.mse(point.quality)  # a plain texture leaves no error at all
-        self._aim(worse, point.coded.wire_bytes / self._expected.size_bytes(point.quality))
+        self._aim(worse, len(point.coded.payload) / self._expected.size_bytes(point.quality))
         if self._next in self._tried:
             self._next = None if reached or self.limited else self._above(point.quality)
 
@@ -81,11 +107,11 @@ class QualitySearch:
         """A try would be adopted nowhere, and what is held is too poor: at least `needed` would be."""
         self._next = max(needed, quality + 1) if max(needed, quality + 1) <= self._highest else None
 
-    def too_large(self, quality: int, wire_bytes: int) -> None:
+    def too_large(self, quality: int, payload_bytes: int) -> None:
         """A try took more than there is; nothing at or above its quality fits."""
         self._highest = quality - 1
         self.limited = True
-        self._aim(1.0, wire_bytes / self._expected.size_bytes(quality))
+        self._aim(1.0, payload_bytes / self._expected.size_bytes(quality))
         if self._highest < self._lowest:
             self._next = None
 
@@ -104,6 +130,8 @@ class QualitySearch:
     def _aim(self, worse: float, larger: float) -> None:
         """Choose the next quality, given how far the expectation was off: factors on squared error and bytes."""
         wanted = self._expected.quality_for_mse(MARGIN * self._target / worse)
-        affordable = self._expected.quality_for_bytes(self._limit / larger) if math.isfinite(self._limit) else wanted
+        affordable = wanted
+        if math.isfinite(self._aim_bytes):
+            affordable = self._expected.quality_for_bytes(self._aim_bytes / larger)
         self.limited |= affordable < wanted
         self._next = min(max(min(wanted, affordable), self._lowest), self._highest)

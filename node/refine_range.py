@@ -6,12 +6,13 @@ fewest bytes wins. Every trial is reconstructed and compared with the scan, as t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from node.coded import Coded, Part, own_inside, region_lattice, rho_of
+from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
@@ -23,7 +24,7 @@ from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import RangeParameters
 from protocol.reconstruct import Selection, content_hashes, cut, range_patch
 from protocol.region import Region
-from protocol.strips import Strip, Strips, build_strips, select_strips
+from protocol.strips import LENGTH, Strip, Strips, build_strips, join_parts, select_strips
 
 SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
 PERCENTILE = 99
@@ -41,16 +42,15 @@ class Choice:
     expected_bytes: float
 
 
-def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: float) -> Choice:
-    """The cheapest parameters whose error in the region is at most target_steps (99th percentile, "higher")."""
-    fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
+def choose_range(trials: Callable[[int], Trial | None], target_steps: float) -> Choice:
+    """The cheapest parameters whose error in the region is at most target_steps (99th percentile, "higher").
+
+    trials : the trial of each spacing, None where it is impossible.
+    """
     best: Choice | None = None
     for p in SPACINGS:
-        strips = _trial_strips(fresh, region, p)
-        if not strips or (p > 1 and target_steps < 1):
-            continue
-        trial = _Trial(scan, strips, region)
-        if trial.error(1) > target_steps:
+        trial = None if p > 1 and target_steps < 1 else trials(p)
+        if trial is None or trial.error(1) > target_steps:
             continue
         quantum = _largest_quantum(trial, target_steps)
         size_bytes = trial.expected_bytes(quantum) * max(2 * target_steps / quantum, 1) ** FINENESS_COSTS
@@ -58,6 +58,16 @@ def choose_range(scan: Scan, state: ClientState, region: Region, target_steps: f
             break
         best = Choice(RangeParameters(p=p, quantum=quantum), trial.error(quantum), size_bytes)
     return best or Choice(RangeParameters(p=1, quantum=1), 0.0, 0.0)
+
+
+def trial_of(scan: Scan, state: ClientState, region: Region, p: int) -> Trial | None:
+    """One spacing over a region, as if nothing were held there; None where the scan cannot be sampled so."""
+    if scan.spec.width % p:
+        return None
+    fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
+    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p))
+    strips = select_strips(lattices, fresh, range_rank(1))
+    return Trial(scan, strips, region) if strips else None
 
 
 def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangeParameters) -> Coded | None:
@@ -106,8 +116,13 @@ def select_range_lattice(state: ClientState, parameters: Parameters, quantum: in
 
 
 def expected_range_bytes(scan: Scan, strips: Strips, quantum: int) -> float:
-    """About how many bytes the payload takes."""
-    return sum(_surveyed(scan, strip.selection, quantum) for strip in strips)
+    """About how many bytes strips take on the wire; 0 where there are none."""
+    if not strips:
+        return 0.0
+    masks = join_parts([encode_mask(void_cells(scan, strip.selection)) for strip in strips])
+    payload_bytes = sum(_surveyed(scan, strip.selection, quantum) for strip in strips)
+    overhead = message_overhead(strips[0].selection.lattice.parameters) + LENGTH.size * (len(strips) - 1)
+    return framed(overhead + len(masks) + round(payload_bytes))
 
 
 def _surveyed(scan: Scan, selection: Selection, quantum: int) -> float:
@@ -145,7 +160,7 @@ def settle_range(scan: Scan, state: ClientState, coded: Coded, target_steps: flo
         state.far[to, blocks[1][:, None]] = far[place, columns[:, None]]
 
 
-class _Trial:
+class Trial:
     """One spacing over a region: what error a quantum leaves."""
 
     def __init__(self, scan: Scan, strips: Strips, region: Region) -> None:
@@ -206,15 +221,7 @@ def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:
     return 65535 - int(held.rank[where][improves].max(initial=COARSE_RANK))
 
 
-def _trial_strips(fresh: ChannelHoldings, region: Region, p: int) -> Strips:
-    if 2 * fresh.shape.width % (2 * p):
-        return ()
-    return select_strips(
-        build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p)), fresh, range_rank(1)
-    )
-
-
-def _largest_quantum(trial: _Trial, target_steps: float) -> int:
+def _largest_quantum(trial: Trial, target_steps: float) -> int:
     """Largest quantum that keeps the region's error within target_steps, to a tenth."""
     low, high = 1, min(max(int(QUANTUM_SHARE_MAX * target_steps), 1), QUANTUM_MAX)
     while high - low > low // 10:

@@ -12,7 +12,7 @@ from node.coded import Coded, Part, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
-from node.texture_model import TextureModel
+from node.texture_model import SPACINGS, TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
 from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
 from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
@@ -24,7 +24,6 @@ from protocol.rings import ring_strides
 from protocol.strips import Strips, blocks_of, build_strips, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
-SPACINGS = (8, 4, 2, 1)
 LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
@@ -83,8 +82,7 @@ def code_texture_lattice(
 def listed_texture(state: ClientState, region: Region, target_mse: float) -> tuple[int, ...] | None:
     """Runs over a region's blocks that list those not held well enough; None where nearly all are (F-07b)."""
     held = state.holdings.channels[Channel.TEXTURE]
-    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % held.shape.blocks[1])
+    place = _place(held.shape.blocks, region)
     touched = region.touched(TEXTURE_BLOCK)
     good = touched & (held.rank[place] > COARSE_RANK) & (state.missed[place] <= target_mse)
     return mask_to_runs(touched & ~good) if good[touched].mean() >= LISTED_SHARE else None
@@ -156,18 +154,25 @@ def _patch_error(scan: Scan, selection: Selection, region: Region, patch: ImageA
     return total, 3 * cv2.countNonZero(wanted)
 
 
-def held_error(
-    state: ClientState, coded: Coded | None, region: Region, model: TextureModel | None, target_mse: float
-) -> tuple[float, int]:
-    """Squared error in the blocks of a region that a refinement leaves as they are, and of how many values.
+def left_alone(state: ClientState, coded: Coded | None, region: Region) -> BoolArray:
+    """Which of a region's blocks a refinement (or none) leaves as they are. (rows, columns) of Region.blocks, bool"""
+    kept = np.ones(state.missed.shape, np.bool_)
+    if coded is not None:
+        kept.ravel()[blocks_of(coded.strips)] = False
+    return kept[_place(kept.shape, region)] & region.touched(TEXTURE_BLOCK)
 
+
+def held_error(
+    state: ClientState, kept: BoolArray, region: Region, model: TextureModel | None, target_mse: float
+) -> tuple[float, int]:
+    """Squared error in some of a region's blocks as they are held, and of how many values.
+
+    kept : which, (rows, columns) of Region.blocks.
     Blocks that were never measured count as the model expects them, or as just good enough without one.
     """
-    kept = _kept_in(state.shapes[Channel.TEXTURE], coded, region)
-    left, top, wide, _ = region.blocks(TEXTURE_BLOCK)
-    columns = np.arange(left, left + wide) % state.missed.shape[1]
+    every_row, every_column = _place(state.missed.shape, region)
     rows, across = np.nonzero(kept)
-    rows, across = rows + top, columns[across]
+    rows, across = every_row.ravel()[rows], every_column.ravel()[across]
     mse = state.missed[rows, across].astype(np.float64)
     unknown = np.isnan(mse)
     if model is None:
@@ -179,23 +184,18 @@ def held_error(
     return float(inside @ mse), int(inside.sum())
 
 
-def quality_to_mend(state: ClientState, coded: Coded | None, region: Region, target_mse: float) -> int:
-    """The quality at which the too poor blocks that a refinement leaves as they are would be sent again; 0: none is."""
-    held = state.holdings.channels[Channel.TEXTURE]
-    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    place = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % held.shape.blocks[1])
-    poor = _kept_in(held.shape, coded, region) & (state.missed[place] > target_mse)
+def quality_to_mend(state: ClientState, kept: BoolArray, region: Region, target_mse: float) -> int:
+    """The quality at which the too poor of the blocks that are kept would be sent again; 0: none is."""
+    held, place = state.holdings.channels[Channel.TEXTURE], _place(state.missed.shape, region)
+    poor = kept & (state.missed[place] > target_mse)
     return int(held.rank[place][poor].max(initial=0)) - 1 + RANK_MARGIN[Channel.TEXTURE] if poor.any() else 0
 
 
-def _kept_in(shape: ChannelShape, coded: Coded | None, region: Region) -> BoolArray:
-    """Which of a region's blocks a refinement leaves as they are. (rows, columns) of Region.blocks"""
-    kept = np.ones(shape.blocks, np.bool_)
-    if coded is not None:
-        kept.ravel()[blocks_of(coded.strips)] = False
+def _place(blocks: tuple[int, ...], region: Region) -> tuple[IntArray, IntArray]:
+    """Index of a region's blocks, those of Region.blocks."""
     left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    columns = np.arange(left, left + wide) % kept.shape[1]
-    return kept[top : top + high][:, columns] & region.touched(TEXTURE_BLOCK)
+    rows, columns = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % blocks[1])
+    return rows, columns
 
 
 def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> IntArray:

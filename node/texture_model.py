@@ -1,14 +1,16 @@
 """What a scan's texture costs and how good it gets, place by place, at every quality: measured once for each scan.
 
-The whole texture is coded at a few qualities, tile by tile, when a scan is opened. From then on the first guess at a
-quality is nearly always the right one, so that an update is encoded once. Bytes of a tile and of a patch differ a
-little (a patch is larger); how much is learned from every update that is sent.
+The whole texture is coded at a few qualities by each codec, tile by tile, when a scan is opened. From then on the first
+guess at a quality is nearly always the right one, so that an update is encoded once. A tile's bytes are spread over its
+cells by how much detail each keeps; what any image takes however little is in it, so that a patch has it once and not
+for each of its tiles, is found by coding some tiles again, four in one. What is still missed is learned from every
+update that is sent.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 
@@ -16,62 +18,107 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.codec import LOSSLESS, TextureCodec, decode_texture, encode_texture
+from protocol.codec import (
+    JPEG_QUALITY_MAX,
+    JPEG_QUALITY_MIN,
+    LOSSLESS,
+    TextureCodec,
+    decode_texture,
+    encode_texture,
+)
 from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray
 from protocol.region import Region
 
-QUALITIES = (6, 20, 34, 48, 62)
-TILE = 256
+QUALITIES = {
+    TextureCodec.HTJ2K: (6, 20, 34, 48, 62),
+    TextureCodec.JPEG: (JPEG_QUALITY_MIN, 22, 32, 43, JPEG_QUALITY_MAX),
+}
+SPACINGS = (8, 4, 2, 1)
 CELL = 16
+TILE_SIDES = 64, 256  # texels: a window that people look at has some of them
+TILES_A_TURN = 16
+JOINED_EVERY = 5  # of the tiles two by two, one in so many is coded as one
 MSE_MIN = 1e-3
 FIRST_QUALITY = 38
 LOG_MSE_SLOPE = 0.08  # of a step of quality, on typical skin
 LOG_BYTES_SLOPE = 0.07
-TILE_OVERHEAD_BYTES = 18  # of a code stream whatever its size: a patch has it once
 BIAS_WEIGHT = 0.3
-JPEG_BIAS = 1.6  # what a JPEG of equal quality takes, until an update tells
+WEIGHT_MIN = 0.1  # of a cell that keeps no detail, in doublings of error
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What a region's texture is expected to take and to reach. (one value per quality tried)"""
+    """What a region's texture is expected to take and to reach, at some qualities. (one value each)"""
 
+    qualities: tuple[int, ...]
     log_mse: FloatArray
     log_bytes: FloatArray
 
     def mse(self, quality: float) -> float:
         """Squared error per value at a quality."""
-        return float(np.exp(_extended(quality, self.log_mse)))
+        return float(np.exp(self._at(quality, self.log_mse)))
 
     def size_bytes(self, quality: float) -> float:
         """Payload at a quality."""
-        return float(np.exp(_extended(quality, self.log_bytes)))
+        return float(np.exp(self._at(quality, self.log_bytes)))
+
+    def beside(self, share: float, other_mse: float) -> Expected:
+        """The same where only a share of the values is sent and the others keep an error of their own."""
+        return Expected(self.qualities, np.log(share * np.exp(self.log_mse) + (1 - share) * other_mse), self.log_bytes)
 
     @classmethod
     def generic(cls, target_mse: float, size_bytes: float) -> Expected:
         """Where nothing is known of a scan: the target at FIRST_QUALITY for size_bytes, usual slopes round it."""
-        steps = np.array(QUALITIES, np.float64) - FIRST_QUALITY
-        return cls(np.log(target_mse) - LOG_MSE_SLOPE * steps, np.log(size_bytes) + LOG_BYTES_SLOPE * steps)
+        qualities = QUALITIES[TextureCodec.HTJ2K]
+        steps = np.array(qualities, np.float64) - FIRST_QUALITY
+        return cls(qualities, np.log(target_mse) - LOG_MSE_SLOPE * steps, np.log(size_bytes) + LOG_BYTES_SLOPE * steps)
 
     def quality_for_mse(self, mse: float) -> int:
         """The lowest quality that should leave no more than this error."""
         falling = np.minimum.accumulate(self.log_mse)
         wanted = np.log(max(mse, MSE_MIN))
-        slope = (falling[-1] - falling[-2]) / (QUALITIES[-1] - QUALITIES[-2])
+        slope = self._last_slope(falling)
         beyond = min((wanted - falling[-1]) / slope, LOSSLESS) if slope < 0 and wanted < falling[-1] else 0
-        return int(np.ceil(np.interp(-wanted, -falling, QUALITIES) + beyond))
+        return int(np.ceil(np.interp(-wanted, -falling, self.qualities) + beyond))
 
     def quality_for_bytes(self, size_bytes: float) -> int:
-        """The highest quality that should take no more than this."""
+        """The highest quality that should take no more than this; -1 where none does."""
         rising = np.maximum.accumulate(self.log_bytes)
         wanted = np.log(max(size_bytes, 1.0))
-        slope = (rising[-1] - rising[-2]) / (QUALITIES[-1] - QUALITIES[-2])
+        slope, first = self._last_slope(rising), self._first_slope(rising)
         beyond = max(wanted - rising[-1], 0) / slope if slope > 0 else 0
-        return int(np.floor(np.interp(wanted, rising, QUALITIES) + beyond))
+        below = max(rising[0] - wanted, 0) / first if first > 0 else LOSSLESS * float(wanted < rising[0])
+        return max(int(np.floor(np.interp(wanted, rising, self.qualities) + beyond - below)), -1)
+
+    def _at(self, quality: float, values: FloatArray) -> float:
+        """Linear interpolation, the first and the last slope kept beyond."""
+        beyond = max(quality - self.qualities[-1], 0) * self._last_slope(values)
+        below = min(quality - self.qualities[0], 0) * self._first_slope(values)
+        return float(np.interp(quality, self.qualities, values) + beyond + below)
+
+    def _last_slope(self, values: FloatArray) -> float:
+        return float((values[-1] - values[-2]) / (self.qualities[-1] - self.qualities[-2]))
+
+    def _first_slope(self, values: FloatArray) -> float:
+        return float((values[1] - values[0]) / (self.qualities[1] - self.qualities[0]))
+
+
+class _Measured:
+    """What one codec makes of a texture at one spacing. (one value per quality and cell, or per quality)
+
+    mse : squared error per value.  content : bytes, but for what every image takes.  constant : that.
+    """
+
+    def __init__(self, codec: TextureCodec, p: int, cells: tuple[int, int]) -> None:
+        self.codec, self.p, self.qualities = codec, p, QUALITIES[codec]
+        self.mse = np.empty((len(self.qualities), *cells), np.float32)
+        self.content = np.empty((len(self.qualities), *cells), np.float32)
+        self.constant = np.zeros(len(self.qualities))
+        self.bias = 1.0
 
 
 class TextureModel:
-    """Expected bytes and error of any region of one scan's texture, at spacing 1. Safe to use from several threads.
+    """Expected bytes and error of any region of one scan's texture. Safe to use from several threads.
 
     texture : (Ht, Wt, 3) uint8 RGB; coded whole, once, in the calling thread.
     first_view : the same as a client sees it that has nothing else; None: as bad as can be.
@@ -84,101 +131,141 @@ class TextureModel:
         first_view: ImageArray | None = None,
         unwanted: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._shape = texture.shape[:2]
-        rows, columns = (-(-size // TILE) for size in self._shape)
-        self._bytes = np.empty((len(QUALITIES), rows, columns))
-        cells = tuple(-(-size // CELL) for size in self._shape)
-        self._mse = np.empty((len(QUALITIES), *cells), np.float32)
-        self._first_mse = np.full(cells, 255.0**2, np.float32)
-        self._bias = {TextureCodec.HTJ2K: 1.0, TextureCodec.JPEG: JPEG_BIAS}
+        height, width = texture.shape[:2]
+        self._cells = -(-height // CELL), -(-width // CELL)
+        self._first_mse = np.full(self._cells, 255.0**2, np.float32)
+        if first_view is not None:
+            self._first_mse[:] = _cell_errors(texture, first_view)
         self._lock = threading.Lock()
-        for row in range(rows):
-            for column in range(columns):
-                if unwanted():
-                    raise CancelledError
-                self._measure(texture, first_view, row, column)
+        self._measured = {
+            (codec, p): _Measured(codec, p, self._cells) for codec in QUALITIES for p in SPACINGS
+        }
+        for measured in self._measured.values():
+            _survey(measured, texture, unwanted)
 
-    def expect(self, region: Region, codec: TextureCodec) -> Expected:
-        """What the blocks that a region touches will take and reach."""
+    def expect(self, region: Region, codec: TextureCodec, p: int = 1, among: BoolArray | None = None) -> Expected:
+        """What the blocks that a region touches will take and reach at a spacing, or those among them.
+
+        p : one of SPACINGS.   among : (rows, columns) of Region.blocks, bool; None: all that it touches.
+        """
+        measured = self._measured[codec, p]
         left, top, wide, high = region.blocks(CELL)
-        columns = np.arange(left, left + wide) % self._mse.shape[2]
-        touched = region.touched(CELL)
-        if touched.all():
-            mse = self._mse[:, top : top + high][:, :, columns].mean(axis=(1, 2), dtype=np.float64)
-            tiles = self._share_of_tiles(left * CELL, top * CELL, wide * CELL, high * CELL)
-        else:
-            mse = self._mse[:, top : top + high][:, :, columns][:, touched].mean(axis=1, dtype=np.float64)
-            tiles = self._touched_tiles(top, columns, touched)
-        size_bytes = (self._bytes * tiles).sum(axis=(1, 2)) * self._bias[codec]
-        return Expected(np.log(np.maximum(mse, MSE_MIN)), np.log(np.maximum(size_bytes, 1.0)))
+        place = slice(None), slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
+        among = region.touched(CELL) if among is None else among
+        mse, content = measured.mse[place][:, among], measured.content[place][:, among]
+        size_bytes = content.sum(axis=1, dtype=np.float64) + measured.constant
+        log_mse = np.log(np.maximum(mse.mean(axis=1, dtype=np.float64), MSE_MIN)) if among.any() else 0 * size_bytes
+        return Expected(measured.qualities, log_mse, np.log(np.maximum(size_bytes * measured.bias, 1.0)))
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
         """Squared error per value of single blocks at qualities of their own; -1 is the first view. (n,) each"""
-        scale = np.array(QUALITIES, np.float64)
+        measured = self._measured[TextureCodec.HTJ2K, 1]
+        scale = np.array(measured.qualities, np.float64)
         above = np.clip(np.searchsorted(scale, quality), 1, scale.size - 1)
         part = np.clip((quality - scale[above - 1]) / (scale[above] - scale[above - 1]), 0, 1)
-        low, high = (np.log(np.maximum(self._mse[index, rows, columns], MSE_MIN)) for index in (above - 1, above))
+        low, high = (np.log(np.maximum(measured.mse[index, rows, columns], MSE_MIN)) for index in (above - 1, above))
         return np.where(quality < 0, self._first_mse[rows, columns], np.exp(low + part * (high - low)))
 
-    def learn(self, codec: TextureCodec, expected_bytes: float, actual_bytes: int) -> None:
+    def learn(self, codec: TextureCodec, p: int, expected_bytes: float, actual_bytes: int) -> None:
         """Take note of what a patch really took."""
         if expected_bytes > 0 and actual_bytes > 0:
             with self._lock:
                 ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
-                self._bias[codec] *= ratio**BIAS_WEIGHT
-
-    def _measure(self, texture: ImageArray, first_view: ImageArray | None, row: int, column: int) -> None:
-        """Code one tile at every quality."""
-        place = slice(row * TILE, (row + 1) * TILE), slice(column * TILE, (column + 1) * TILE)
-        tile = np.ascontiguousarray(texture[place])
-        y, x = row * TILE // CELL, column * TILE // CELL
-        cells = slice(y, y - (-tile.shape[0] // CELL)), slice(x, x - (-tile.shape[1] // CELL))
-        if first_view is not None:
-            self._first_mse[cells] = _cell_errors(tile, np.ascontiguousarray(first_view[place]))
-        for index, quality in enumerate(QUALITIES):
-            payload = encode_texture(tile, TextureCodec.HTJ2K, quality)
-            self._bytes[index, row, column] = max(len(payload) - TILE_OVERHEAD_BYTES, 1)
-            decoded = decode_texture(payload, TextureCodec.HTJ2K, quality, (tile.shape[0], tile.shape[1]))
-            self._mse[(index, *cells)] = _cell_errors(tile, decoded)
-
-    def _touched_tiles(self, top: int, columns: IntArray, touched: BoolArray) -> FloatArray:
-        """How much of each tile some of its cells are, 0..1. touched : of the cells from `top` on, in `columns`."""
-        rows, across = np.nonzero(touched)
-        counts = np.zeros(self._bytes.shape[1:])
-        np.add.at(counts, ((top + rows) * CELL // TILE, columns[across] * CELL // TILE), 1)
-        high, wide = (np.minimum(TILE, size - np.arange(0, size, TILE)) for size in self._shape)
-        return np.asarray(counts * CELL**2 / np.multiply.outer(high, wide))
-
-    def _share_of_tiles(self, left: int, top: int, width: int, height: int) -> FloatArray:
-        """How much of each tile a rectangle covers, 0..1, cyclic in x."""
-        rows = _overlap(top, height, self._bytes.shape[1], self._shape[0])
-        turn = self._shape[1]
-        columns = _overlap(left, min(width, turn - left), self._bytes.shape[2], turn)
-        if left + width > turn:
-            columns = columns + _overlap(0, left + width - turn, self._bytes.shape[2], turn)
-        return np.asarray(np.multiply.outer(rows, columns))
+                self._measured[codec, p].bias *= ratio**BIAS_WEIGHT
 
 
-def _cell_errors(tile: ImageArray, other: ImageArray) -> NDArray[np.float32]:
-    """Squared error per value in each 16 x 16 cell of a tile."""
-    missed = cv2.absdiff(tile, other)
-    rows, columns = -(-tile.shape[0] // CELL), -(-tile.shape[1] // CELL)
+def _survey(measured: _Measured, texture: ImageArray, unwanted: Callable[[], bool]) -> None:
+    """Code a texture by tiles at every quality, and some of them again two by two, and fill in what came of it."""
+    side, p, count = _tile_side(texture.shape[1]), measured.p, len(measured.qualities)
+    taken = {corner: np.zeros(count) for corner in _corners(texture, side)}
+    for (top, left), sizes in taken.items():
+        if unwanted():
+            raise CancelledError
+        tile = _tile(texture, top, left, side)
+        cells = _cells_at(top, left, tile)
+        sampled = _averaged(tile, p)
+        detail = _cell_errors(sampled, np.asarray(cv2.blur(sampled, (9, 9)), np.uint8), CELL // p)
+        for index, quality in enumerate(measured.qualities):
+            payload = encode_texture(sampled, measured.codec, quality)
+            decoded = decode_texture(payload, measured.codec, quality, (sampled.shape[0], sampled.shape[1]))
+            measured.mse[(index, *cells)] = _cell_errors(tile, _spread(decoded, p, tile))
+            missed = _cell_errors(sampled, decoded, CELL // p)
+            kept = np.log2(np.maximum(detail, MSE_MIN) / np.maximum(missed, MSE_MIN))
+            measured.content[(index, *cells)] = np.maximum(kept, 0) + WEIGHT_MIN
+            sizes[index] = len(payload)
+    measured.constant[:] = _constant_bytes(measured, texture, taken, side)
+    for (top, left), sizes in taken.items():
+        weight = measured.content[:, *_cells_at(top, left, _tile(texture, top, left, side))]
+        weight *= (np.maximum(sizes - measured.constant, 1.0) / weight.sum(axis=(1, 2)))[:, None, None]
+
+
+def _constant_bytes(
+    measured: _Measured, texture: ImageArray, taken: dict[tuple[int, int], FloatArray], side: int
+) -> FloatArray:
+    """What four tiles take more than the same texels in one image, for each image saved. (one value per quality)"""
+    saved = []
+    for index, (top, left) in enumerate(_corners(texture, 2 * side)):
+        four = [taken.get((top + y, left + x)) for y in (0, side) for x in (0, side)]
+        parts = [sizes for sizes in four if sizes is not None]
+        if index % JOINED_EVERY or len(parts) < len(four):
+            continue
+        whole = _averaged(_tile(texture, top, left, 2 * side), measured.p)
+        joined = [len(encode_texture(whole, measured.codec, quality)) for quality in measured.qualities]
+        saved.append((np.sum(parts, axis=0) - joined) / 3)
+    if not saved:
+        return np.zeros(len(measured.qualities))
+    usual = np.median(list(taken.values()), axis=0)
+    return np.asarray(np.clip(np.mean(saved, axis=0), 0, usual))
+
+
+def _corners(texture: ImageArray, side: int) -> Iterator[tuple[int, int]]:
+    """Top and left of each tile."""
+    for top in range(0, texture.shape[0], side):
+        for left in range(0, texture.shape[1], side):
+            yield top, left
+
+
+def _tile(texture: ImageArray, top: int, left: int, side: int) -> ImageArray:
+    return np.ascontiguousarray(texture[top : top + side, left : left + side])
+
+
+def _averaged(tile: ImageArray, p: int) -> ImageArray:
+    """The samples that travel of a tile at a spacing."""
+    if p == 1:
+        return tile
+    below, right = -tile.shape[0] % p, -tile.shape[1] % p
+    whole = cv2.copyMakeBorder(tile, 0, below, 0, right, cv2.BORDER_REPLICATE) if below or right else tile
+    size = whole.shape[1] // p, whole.shape[0] // p
+    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
+
+
+def _spread(decoded: ImageArray, p: int, tile: ImageArray) -> ImageArray:
+    """About what a client makes of them: the tile again."""
+    if p == 1:
+        return decoded
+    size = decoded.shape[1] * p, decoded.shape[0] * p
+    return np.asarray(cv2.resize(decoded, size, interpolation=cv2.INTER_LINEAR)[: tile.shape[0], : tile.shape[1]])
+
+
+def _tile_side(width: int) -> int:
+    smallest, largest = TILE_SIDES
+    return min(max(1 << max(width // TILES_A_TURN, 1).bit_length() - 1, smallest), largest)
+
+
+def _cells_at(top: int, left: int, tile: ImageArray) -> tuple[slice, slice]:
+    """The cells of a tile that starts at whole ones."""
+    y, x = top // CELL, left // CELL
+    return slice(y, y - (-tile.shape[0] // CELL)), slice(x, x - (-tile.shape[1] // CELL))
+
+
+def _cell_errors(tile: ImageArray, other: ImageArray, side: int = CELL) -> NDArray[np.float32]:
+    """Squared error per value in each cell of a tile."""
+    missed = cv2.absdiff(tile, np.ascontiguousarray(other))
+    rows, columns = -(-tile.shape[0] // side), -(-tile.shape[1] // side)
+    below, right = rows * side - tile.shape[0], columns * side - tile.shape[1]
+    if below or right:
+        missed = cv2.copyMakeBorder(missed, 0, below, 0, right, cv2.BORDER_REPLICATE)
     squared = cv2.resize(
         cv2.multiply(missed, missed, dtype=cv2.CV_32F), (columns, rows), interpolation=cv2.INTER_AREA
     )
     return np.asarray(squared.reshape(rows, columns, 3).mean(axis=2), np.float32)
-
-
-def _overlap(start: int, length: int, tiles: int, size: int) -> FloatArray:
-    """Share of each tile of an axis inside start..start + length."""
-    begin = TILE * np.arange(tiles)
-    end = np.minimum(begin + TILE, size)
-    inside = np.minimum(end, start + length) - np.maximum(begin, start)
-    return np.asarray(np.maximum(inside, 0) / (end - begin))
-
-
-def _extended(quality: float, values: FloatArray) -> float:
-    """Linear interpolation over QUALITIES, the last slope kept beyond them."""
-    slope = (values[-1] - values[-2]) / (QUALITIES[-1] - QUALITIES[-2])
-    beyond = max(quality - QUALITIES[-1], 0)
-    return float(np.interp(quality, QUALITIES, values) + beyond * slope)

@@ -11,7 +11,6 @@ escapes", and all of it is deflated.
 
 from __future__ import annotations
 
-import math
 import zlib
 
 import numpy as np
@@ -25,6 +24,8 @@ _ESCAPE = 3
 _BYTE = 255
 _DEFLATE_LEVEL = 6
 _WORD_MAX = 4 * STEPS_MAX
+_RUN_MIN, _RUN_MAX = 4, 258  # equal bytes that deflate makes one code of
+_EXPERIENCE = 0.97, 4.2, 5.5, 77.0  # bits a bit of entropy, a run, a symbol used, a stream
 
 Int32Array = NDArray[np.int32]
 
@@ -48,7 +49,7 @@ def encode_and_decode(
 def survey(range_steps: StepArray, quantum: int, care: BoolArray | None = None) -> tuple[StepArray, float]:
     """What `decode` will return, and about how many bytes it will take, without coding it."""
     decoded, missed = _analysed(range_steps, quantum, care)
-    return _clamped(decoded), _expected_bytes(missed)
+    return _clamped(decoded), _expected_bytes(_pack(missed))
 
 
 def decode(payload: bytes, shape: tuple[int, int], quantum: int) -> StepArray:
@@ -132,15 +133,26 @@ def _synthesise(values: _Reader, shape: tuple[int, int], quantum: int) -> Int32A
     return decoded
 
 
-def _expected_bytes(missed: Int32Array) -> float:
-    """Where the misses are, by its entropy, and their sizes at about two bits a doubling."""
-    some = np.abs(missed[missed != 0]).astype(np.float64)
-    share = some.size / missed.size
-    if not 0 < share < 1:
-        return 8.0 + float(2 * np.log2(some + 1).sum()) / 8
-    places: float = -missed.size * (share * math.log2(share) + (1 - share) * math.log2(1 - share))
-    sizes = float(2 * np.log2(some).sum())
-    return float(8 + (places + some.size + sizes) / 8)
+def _expected_bytes(packed: bytes) -> float:
+    """What deflate should make of packed misses: literals and runs by their entropy, codes and streams by experience.
+
+    Fitted to 1500 payloads of 8 scans (S and M, spacings 1 to 8, quanta 1 to 1024): 6% off, 3% where they are long.
+    """
+    data = np.frombuffer(packed, np.uint8)
+    start = np.flatnonzero(np.concatenate([[True], data[1:] != data[:-1]]))
+    length, value = np.diff(start, append=data.size), data[start]
+    is_run = length >= _RUN_MIN
+    single = np.repeat(value, np.where(is_run, 1, length))
+    rest = (length[is_run] - 1) % _RUN_MAX
+    doublings = np.log2(np.maximum(rest, 1))
+    whole_runs = int(((length[is_run] - 1) // _RUN_MAX).sum())
+    symbols = np.concatenate([np.bincount(single), np.bincount(np.floor(2 * doublings).astype(np.int64)), [whole_runs]])
+    symbols = symbols[symbols > 0]
+    entropy = float(-(symbols * np.log2(symbols / symbols.sum())).sum())
+    extra = float(np.maximum(doublings - 2, 0).sum())
+    runs = rest.size + whole_runs
+    bits, of_a_run, of_a_symbol, of_a_stream = _EXPERIENCE
+    return (bits * (entropy + extra) + of_a_run * runs + of_a_symbol * symbols.size + of_a_stream) / 8
 
 
 def _pack(missed: Int32Array) -> bytes:

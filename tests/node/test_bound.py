@@ -20,7 +20,7 @@ from protocol.lattice import Channel
 from tests.node.scans import keep, make_grid
 
 BOTH: tuple[m.CodecName, ...] = ("jpeg", "htj2k")
-EASY, HARD = m.Look(2, 0.75, 0.5, texture_db=36), m.Look(2, 0.75, 0.5, texture_db=55)
+EASY, HARD = m.Look(2, 0.75, 0.5, texture_db=35), m.Look(2, 0.75, 0.5, texture_db=55)
 NOISE = 1e-9
 STATE = cast("ClientState", None)  # nobody looks at it
 

@@ -113,7 +113,7 @@ def test_where_both_do_not_fit_the_mesh_goes_alone(scan: Scan, view: ClassicView
     update = plan_classic(scan, view.state, ask(parameters=explicit), 900)
     assert [one.lattice.shape.channel for one in update.coded] == [Channel.RANGE]
     assert update.reason == "byte limit"
-    assert plan_classic(scan, view.state, ask(parameters=explicit), 250).coded == ()
+    assert plan_classic(scan, view.state, ask(parameters=explicit), REPLY_BYTES + 60).coded == ()
 
 
 def test_the_viewers_knobs_are_alpha_and_sigma(scan: Scan, view: ClassicView) -> None:

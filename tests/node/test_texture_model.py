@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -28,12 +29,43 @@ def test_the_first_guess_is_near(u: float, target_db: float) -> None:
     expected = MODEL.expect(region, TextureCodec.HTJ2K)
     mse, size = coded(region, expected.quality_for_mse(mse_of_db(target_db)))
     assert db_of_mse(mse) == pytest.approx(target_db, abs=1.5)
-    assert expected.size_bytes(expected.quality_for_mse(mse_of_db(target_db))) == pytest.approx(size, rel=0.4)
+    assert expected.size_bytes(expected.quality_for_mse(mse_of_db(target_db))) == pytest.approx(size, rel=0.25)
+
+
+@pytest.mark.parametrize("codec", list(TextureCodec))
+@pytest.mark.parametrize("p", [1, 2, 4])
+@pytest.mark.parametrize("quality", [34, 45])
+def test_every_codec_and_spacing_is_known(codec: TextureCodec, p: int, quality: int) -> None:
+    region = Region(320, 80, 320, 160, 640)
+    patch = TEXTURE[region.rows][:, region.columns]
+    samples = np.asarray(cv2.resize(patch, (320 // p, 160 // p), interpolation=cv2.INTER_AREA), np.uint8)
+    payload = encode_texture(samples, codec, quality)
+    decoded = decode_texture(payload, codec, quality, (160 // p, 320 // p))
+    missed = cv2.resize(decoded, (320, 160), interpolation=cv2.INTER_LINEAR).astype(float) - patch
+    expected = MODEL.expect(region, codec, p)
+    assert 1 / 2 < expected.size_bytes(quality) / len(payload) < 2  # half of this texture is noise
+    assert db_of_mse(expected.mse(quality)) == pytest.approx(db_of_mse(float(np.mean(missed**2))), abs=1.5)
+
+
+def test_a_part_takes_a_part() -> None:
+    region = region_round(0.5, 0.5, 0.2, TEXTURE.shape[1], TEXTURE.shape[0])
+    _, _, wide, high = region.blocks(16)
+    left = np.zeros((high, wide), np.bool_)
+    left[:, : wide // 2] = True
+    whole = MODEL.expect(region, TextureCodec.HTJ2K).size_bytes(40)
+    parts = [MODEL.expect(region, TextureCodec.HTJ2K, 1, among).size_bytes(40) for among in (left, ~left)]
+    assert max(parts) < whole < sum(parts) < 1.3 * whole
+
+
+def test_what_is_kept_counts_in_the_error() -> None:
+    expected = Expected.generic(mse_of_db(40), 5000).beside(0.5, mse_of_db(30))
+    alone = Expected.generic(mse_of_db(40), 5000)
+    assert expected.mse(34) == pytest.approx((alone.mse(34) + mse_of_db(30)) / 2)
 
 
 def test_quality_for_bytes_undoes_size_bytes() -> None:
     expected = MODEL.expect(region_round(0.7, 0.5, 0.1, TEXTURE.shape[1], TEXTURE.shape[0]), TextureCodec.HTJ2K)
-    for quality in (10, 30, 50, 70, 90):
+    for quality in (2, 10, 30, 50, 70, 90):
         assert expected.quality_for_bytes(expected.size_bytes(quality) * 1.001) == pytest.approx(quality, abs=1)
 
 
@@ -42,7 +74,7 @@ def test_bytes_are_learned_from_what_is_sent() -> None:
     region = region_round(0.5, 0.5, 1.0, 256, 256)
     before = model.expect(region, TextureCodec.JPEG).size_bytes(40)
     for _ in range(20):
-        model.learn(TextureCodec.JPEG, model.expect(region, TextureCodec.JPEG).size_bytes(40), round(1.3 * before))
+        model.learn(TextureCodec.JPEG, 1, model.expect(region, TextureCodec.JPEG).size_bytes(40), round(1.3 * before))
     assert model.expect(region, TextureCodec.JPEG).size_bytes(40) == pytest.approx(1.3 * before, rel=0.03)
 
 

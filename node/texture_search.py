@@ -1,0 +1,237 @@
+"""The texture of one look: spacing, quality and blocks that reach the PSNR asked for, or that fit a limit.
+
+The scan's model says what every spacing and quality will take and leave, so the choice among them costs no encode, and
+one encode is most often all: QualitySearch corrects where the model was wrong.
+
+Source: REQUIREMENTS F-14b, E-01.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from node.coded import Coded, framed, message_overhead
+from node.library import Scan
+from node.quality import MARGIN, Encodes, Point, QualitySearch
+from node.refine_texture import (
+    CODECS,
+    adopted_error,
+    choose_spacing,
+    code_texture_lattice,
+    held_error,
+    left_alone,
+    listed_texture,
+    measured,
+    mse_of_db,
+    quality_bounds,
+    quality_to_mend,
+    texture_lattice,
+)
+from node.state import ClientState
+from node.texture_model import SPACINGS, Expected, TextureModel
+from protocol.grid import TEXTURE_BLOCK, BoolArray
+from protocol.lattice import Channel, Parameters, runs_to_mask
+from protocol.messages import CodecName, Look, TextureParameters
+from protocol.region import Region
+
+SKIRT_S = 1.0
+WHOLE_SHARE = 0.7  # of what a whole window takes: where a part takes more, the whole is tried too
+HELD_MARGIN = 0.95  # what is held is known block by block, not texel by texel
+FINEST_SHARE = 1.03  # of what another spacing takes: up to there spacing 1 is preferred
+GENERIC_BYTES_PER_TEXEL = 0.04
+NO_TEXTURE = 16.0  # how much larger than wanted an error is left where no texture is sent, until it is known
+OVERHEAD_BYTES = framed(message_overhead(Parameters(2, 0, 0, 1, 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """A spacing, what it is expected to leave of the error and to take, and whether it reaches what was asked for."""
+
+    p: int
+    mse: float
+    size_bytes: float
+    reaches: bool
+
+
+class TextureSearch:
+    """Finds the texture refinement that answers a look.
+
+    limited : bytes have kept it from the quality asked for.   mse : error left in the window; None until measured.
+    """
+
+    def __init__(
+        self,
+        scan: Scan,
+        state: ClientState,
+        look: Look,
+        region: Region,
+        codec: CodecName,
+        model: TextureModel | None,
+        quick: bool,
+        encodes: Encodes,
+    ) -> None:
+        self._scan, self._state, self._look, self._region, self._model = scan, state, look, region, model
+        self._codec: CodecName = codec
+        self._quick, self._encodes = quick, encodes
+        self._target_mse = mse_of_db(look.texture_db)
+        self._lowest, self._highest = quality_bounds(codec)
+        self.limited = False
+        self.mse: float | None = None
+
+    def expected_mse(self, limit_bytes: float) -> float:
+        """Error per value expected in the window when the refinement may take so many bytes on the wire; 0: none."""
+        choice = self._choose(limit_bytes - OVERHEAD_BYTES, None)
+        if choice is not None:
+            return choice.mse
+        return self._error(None) if self._model is not None else self._target_mse * NO_TEXTURE**2
+
+    def search(self, aim_bytes: float, limit_bytes: float) -> Coded | None:
+        """The cheapest refinement that reaches the quality, else the best one that fits. None: nothing is sent.
+
+        aim_bytes : what it should take on the wire, if it cannot reach the quality.   limit_bytes : what it may.
+        """
+        if self._model is not None and (held := self._error(None)) <= HELD_MARGIN * self._target_mse:
+            self.mse = held
+            return None
+        listed = listed_texture(self._state, self._region, self._target_mse)
+        found = self._search_spacings(aim_bytes, limit_bytes, listed)
+        if listed is None or found is None or found.wire_bytes < WHOLE_SHARE * self._expected_whole_bytes():
+            return found
+        reached = self.mse
+        whole = self._search_spacings(aim_bytes, limit_bytes, None)  # one quality all over may cost less than parts do
+        if whole is not None and whole.wire_bytes < found.wire_bytes:
+            return whole
+        self.mse = reached
+        return found
+
+    def skirt(self, p: float) -> float:
+        """S' of the skirt: as the viewer's alpha says, else thin."""
+        return SKIRT_S if self._look.alpha is None else 1 / (self._look.alpha * p)
+
+    # -- what is expected ------------------------------------------------------------------------------------------
+
+    def _expected(self, p: int, listed: tuple[int, ...] | None) -> Expected:
+        """What texture takes at a spacing, and leaves in the window with what is held there."""
+        if self._model is None:
+            return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
+        if listed is None:
+            return self._model.expect(self._region, CODECS[self._codec], p)
+        among = self._blocks(listed)
+        kept_error, kept = self._held_error(~among & self._region.touched(TEXTURE_BLOCK))
+        expected = self._model.expect(self._region, CODECS[self._codec], p, among)
+        return expected.beside(1 - kept / max(3 * self._region.area, kept), kept_error / max(kept, 1))
+
+    def _blocks(self, listed: tuple[int, ...]) -> BoolArray:
+        _, _, wide, high = self._region.blocks(TEXTURE_BLOCK)
+        return runs_to_mask(listed, wide * high).reshape(high, wide)
+
+    def _expected_whole_bytes(self) -> float:
+        expected = self._expected(1, None)
+        return expected.size_bytes(expected.quality_for_mse(self._target_mse))
+
+    def _choose(self, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
+        """The spacing that takes least to reach the target; where none does, the one that comes nearest to it."""
+        choices = [choice for p in self._spacings() if (choice := self._offer(p, aim_bytes, listed)) is not None]
+        reaching = [choice for choice in choices if choice.reaches]
+        if not reaching:
+            return min(choices, key=lambda choice: choice.mse, default=None)
+        return min(reaching, key=lambda choice: choice.size_bytes * (1 if choice.p == 1 else FINEST_SHARE))
+
+    def _spacings(self) -> tuple[int, ...]:
+        if self._model is None:
+            found = choose_spacing(self._scan, self._state, self._region, self._look.texture_db, self._codec)
+            return (int(found),)
+        turn, wide = self._state.shapes[Channel.TEXTURE].blocks[1], self._region.blocks(TEXTURE_BLOCK)[2]
+        return tuple(p for p in SPACINGS if wide < turn or self._region.turn % p == 0)
+
+    def _offer(self, p: int, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
+        """What a spacing can do for so many bytes of payload; None where it fits at no quality."""
+        expected = self._expected(p, listed)
+        wanted = max(expected.quality_for_mse(MARGIN * self._target_mse), self._lowest)
+        quality = min(wanted, self._highest)
+        if math.isfinite(aim_bytes):
+            quality = min(quality, expected.quality_for_bytes(aim_bytes))
+        if quality < self._lowest:
+            return None
+        return _Choice(p, expected.mse(quality), expected.size_bytes(quality), quality == wanted)
+
+    # -- what is tried ---------------------------------------------------------------------------------------------
+
+    def _search_spacings(self, aim_bytes: float, limit_bytes: float, listed: tuple[int, ...] | None) -> Coded | None:
+        """The best refinement of the blocks listed: at the spacing chosen, else at those next to it."""
+        choice = self._choose(aim_bytes - OVERHEAD_BYTES, listed)
+        if choice is None:
+            self.limited = True
+        p = choice.p if choice else 0
+        best: Point | None = None
+        while p in SPACINGS:
+            bounds = aim_bytes - OVERHEAD_BYTES, limit_bytes - OVERHEAD_BYTES, self._expected(p, listed)
+            search = QualitySearch(self._target_mse, *bounds, self._lowest, self._highest)
+            if not self._try_qualities(search, p, listed):
+                return None
+            self.limited |= search.limited
+            found = search.best()
+            if found is not None and (best is None or found.mse < best.mse):
+                best = found
+            if found is None:
+                p = 2 * p if best is None else 0
+            else:
+                p = p // 2 if found.mse > self._target_mse and not search.limited else 0
+        if best is None:
+            return None
+        self.mse = best.mse
+        return best.coded
+
+    def _try_qualities(self, search: QualitySearch, p: int, listed: tuple[int, ...] | None) -> bool:
+        """Feed a search; False when the client holds all of this already."""
+        while (quality := search.next_quality()) is not None:
+            coded = self._code(p, quality, listed)
+            if coded is None:
+                if self._error(None) <= self._target_mse:
+                    return False
+                search.missed_all(quality, self._mending_quality(None))
+                continue
+            if search.fits(coded):
+                coded = measured(coded)
+                mse = self._error(coded)
+                search.measured(Point(quality, mse, coded))
+                if mse > self._target_mse:
+                    search.at_least(self._mending_quality(coded))
+            else:
+                search.too_large(quality, len(coded.payload))
+            self._learn(p, coded)
+        return True
+
+    def _code(self, p: int, quality: int, listed: tuple[int, ...] | None) -> Coded | None:
+        self._encodes.add()
+        wanted = TextureParameters(p, quality, self._codec, self.skirt(p))
+        parameters = texture_lattice(self._region, wanted)
+        if listed is not None:
+            parameters = replace(parameters, listed=listed)
+        return code_texture_lattice(
+            self._scan, self._state, parameters, quality, CODECS[self._codec], quick=self._quick
+        )
+
+    def _mending_quality(self, coded: Coded | None) -> int:
+        kept = left_alone(self._state, coded, self._region)
+        return quality_to_mend(self._state, kept, self._region, self._target_mse)
+
+    def _error(self, coded: Coded | None) -> float:
+        """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""
+        total, count = 0.0, 0
+        if coded is not None:
+            total, count = adopted_error(self._scan, coded, self._region)
+        held_total, held_count = self._held_error(left_alone(self._state, coded, self._region))
+        return (total + held_total) / max(count + held_count, 1)
+
+    def _held_error(self, kept: BoolArray) -> tuple[float, int]:
+        return held_error(self._state, kept, self._region, self._model, self._target_mse)
+
+    def _learn(self, p: int, coded: Coded) -> None:
+        """Tell the model what a refinement took, where a skirt is not what took it."""
+        if self._model is not None and self._look.alpha is None:
+            codec = CODECS[self._codec]
+            sent = self._region.touched(TEXTURE_BLOCK) & ~left_alone(self._state, coded, self._region)
+            expected = self._model.expect(self._region, codec, p, sent)
+            self._model.learn(codec, p, expected.size_bytes(coded.quality), len(coded.payload))
