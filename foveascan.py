@@ -35,7 +35,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import client.command
 import node.command
@@ -43,11 +43,15 @@ import simulators.command
 from protocol.errors import FoveascanError
 from protocol.printable import printable
 
+if TYPE_CHECKING:
+    from client.session import Session
+
 __version__ = "0.1.0"
 
 PROGRAM = (sys.executable, "-P", "-m", "foveascan")  # -P: a folder called node or client where one stands is not ours
 READY_LINE_MAX_BYTES = 65536
 DEMO_CLICKS = 3
+TRUTH, CLOSED = "truth.npz", "closed.npz"
 END_S = 5.0  # what a program may take to end after SIGTERM
 
 FAILED = 1
@@ -147,65 +151,88 @@ def run_demo(args: argparse.Namespace) -> int:
     """Simulated scanner and node as processes of their own, one sweep, then serve until a signal, or look and end."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that both programs are ended with the blocks below
     with TemporaryDirectory(prefix="foveascan-demo-") as folder:
-        with started(*_simulate(args, f"{folder}/scanner", f"{folder}/truth.npz")) as (_, scanner):
+        with started(*_simulate(args, folder)) as (_, scanner):
             with started(*_serve(scanner["path"], folder)) as (node, ready):
-                quietly = ["--json"] if args.json else []
-                swept = subprocess.run(
-                    [*PROGRAM, "scan", "--node", ready["url"], *quietly], stdout=sys.stderr if args.json else None
-                )
-                if swept.returncode:
-                    return swept.returncode
+                at_node = ["--node", ready["url"], *(["--json"] if args.json else [])]
+                is_closed = bool(scanner.get("closed"))
+                whole = [["import", f"{folder}/{CLOSED}", *at_node]] if is_closed else []
+                for command in (["scan", *at_node], *whole):
+                    ran = subprocess.run([*PROGRAM, *command], stdout=sys.stderr if args.json else None)
+                    if ran.returncode:
+                        return ran.returncode
                 if args.once:
                     import asyncio
 
-                    return asyncio.run(look_once(args, ready["url"], folder))
-                print(f"The scan is at {ready['url']}\nCtrl-C ends the demo.", flush=True)
+                    return asyncio.run(look_once(args, ready["url"], folder, is_closed))
+                also = "; it also has the whole object, poles included, which no sweep sees" if is_closed else ""
+                print(f"The scan is at {ready['url']}{also}\nCtrl-C ends the demo.", flush=True)
                 return node.wait()
 
 
-async def look_once(args: argparse.Namespace, url: str, folder: str) -> int:
-    """Find the node, open its newest scan, look at three places, hold what came against the truth; 0 when it holds."""
-    from client import connect, discover
-    from client.truth import Truth
+async def look_once(args: argparse.Namespace, url: str, folder: str, is_closed: bool) -> int:
+    """Find the node, open its scan, look at three places, hold what came against the truth; 0 when it holds.
 
-    truth = Truth.read(f"{folder}/truth.npz")
+    is_closed : do the same of the whole object that was imported beside the sweep, and look at both its poles, too.
+    """
+    from client import connect, discover
+
     started_s = time.monotonic()
     nodes = await discover()
     found_s = time.monotonic() - started_s
     if url not in {node.url for node in nodes}:
         raise FoveascanError(f"the node at {url} was not discovered; does this machine allow multicast on loopback?")
     async with connect(url) as session:
-        model = await session.open()
-        first_view_bytes = session.stats.bytes_received
-        updates = []
-        for u, v in truth.clicks(DEMO_CLICKS):
-            update = await session.look(u, v)
-            updates.append({
-                "u": u, "v": v, "bytes": update.bytes_received, "elapsed_s": round(update.elapsed_s, 4),
-                **truth.compare(model, u, v),
-            })  # fmt: skip
-        model.export(f"{folder}/model.npz")
-    result = {
-        "scan": model.info.id, "shape": {"range": model.range_steps.shape, "texture": model.texture.shape[:2]},
-        "link_rate": args.link_rate, "discovered_in_s": round(found_s, 3), "first_view_bytes": first_view_bytes,
-        "updates": updates, "ok": all(update["ok"] for update in updates),
-    }  # fmt: skip
+        result = {"link_rate": args.link_rate, "discovered_in_s": round(found_s, 3)}
+        result |= await _look_round(session, "sweep", f"{folder}/{TRUTH}", f"{folder}/model.npz")
+        if is_closed:
+            result["closed"] = await _look_round(session, "import", f"{folder}/{CLOSED}", f"{folder}/closed_model.npz")
+    ok = result["ok"] and (not is_closed or result["closed"]["ok"])
     print(json.dumps(result) if args.json else _told(result), flush=True)
-    return 0 if result["ok"] else FAILED
+    return 0 if ok else FAILED
+
+
+async def _look_round(session: Session, source: str, truth_path: str, model_path: str) -> dict[str, Any]:
+    """Look at places of the newest scan that came so, and compare; export what is held then."""
+    from client.truth import Truth
+
+    truth = Truth.read(truth_path)
+    scan = next(scan["id"] for scan in await session.scans() if scan["source"] == source)
+    before = session.stats.bytes_received
+    model = await session.open(scan)
+    first_view_bytes = session.stats.bytes_received - before
+    updates = []
+    for u, v in truth.clicks(DEMO_CLICKS):
+        update = await session.look(u, v)
+        updates.append({
+            "u": u, "v": v, "bytes": update.bytes_received, "elapsed_s": round(update.elapsed_s, 4),
+            **truth.compare(model, u, v),
+        })  # fmt: skip
+    model.export(model_path)
+    return {
+        "scan": model.info.id, "shape": {"range": model.range_steps.shape, "texture": model.texture.shape[:2]},
+        "first_view_bytes": first_view_bytes, "updates": updates, "ok": all(update["ok"] for update in updates),
+    }  # fmt: skip
 
 
 def _told(result: dict[str, Any]) -> str:
-    lines = [f"first view {result['first_view_bytes']} bytes, found in {result['discovered_in_s']} s"]
-    for update in result["updates"]:
-        lines.append(
-            f"({update['u']:.3f}, {update['v']:.3f}): {update['bytes']} bytes in {update['elapsed_s']:.3f} s, "
-            f"range within {update['range_error_mm_p99']:.3f} mm (99%), texture {update['texture_psnr_db']:.1f} dB"
-        )
-    return "\n".join([*lines, "matches the truth" if result["ok"] else "does NOT match the truth"])
+    lines = [f"first view {result['first_view_bytes']} bytes, found in {result['discovered_in_s']} s", *_looks(result)]
+    if closed := result.get("closed"):
+        lines += [f"the whole object, by direction: first view {closed['first_view_bytes']} bytes", *_looks(closed)]
+    ok = result["ok"] and (not closed or closed["ok"])
+    return "\n".join([*lines, "matches the truth" if ok else "does NOT match the truth"])
 
 
-def _simulate(args: argparse.Namespace, link: str, truth: str) -> list[str]:
-    command = ["simulate", "--link", "pty", "--path", link, "--truth", truth, "--json"]
+def _looks(result: dict[str, Any]) -> list[str]:
+    return [
+        f"({update['u']:.3f}, {update['v']:.3f}): {update['bytes']} bytes in {update['elapsed_s']:.3f} s, "
+        f"range within {update['range_error_mm_p99']:.3f} mm (99%), texture {update['texture_psnr_db']:.1f} dB"
+        for update in result["updates"]
+    ]
+
+
+def _simulate(args: argparse.Namespace, folder: str) -> list[str]:
+    command = ["simulate", "--link", "pty", "--path", f"{folder}/scanner", "--truth", f"{folder}/{TRUTH}", "--json"]
+    command += ["--closed", f"{folder}/{CLOSED}"]
     for option in ("specimen", "texture", "size", "link_rate"):
         if (value := getattr(args, option)) is not None:
             command += [f"--{option.replace('_', '-')}", value]

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from client.model import Model
-from protocol.grid import ImageArray, StepArray
-from protocol.region import region_round
+from exchange.native import read_native
+from protocol.grid import Geometry, ImageArray, StepArray
+from protocol.sphere import region_on
 
 SEED = 7
 WINDOW = 0.05
@@ -22,23 +23,34 @@ PSNR_MAX_DB = 100.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What a simulated scanner swept: range_steps (H, W) uint16, 0 = void; texture (Ht, Wt, 3) uint8; step_mm."""
+    """What a scan should be: range_steps (H, W) uint16, 0 = void; texture (Ht, Wt, 3) uint8; step_mm; geometry."""
 
     range_steps: StepArray
     texture: ImageArray
     step_mm: float
+    geometry: Geometry = "cylinder"
 
     @classmethod
     def read(cls, path: str | Path) -> Truth:
-        """The file that `foveascan simulate --truth` writes. Raises OSError."""
-        with np.load(path, allow_pickle=False) as file:
-            return cls(file["depth_u16"], file["texture"], float(file["scale_mm"]))
+        """A file that `foveascan simulate` writes, --truth or --closed. Raises OSError, ExchangeError."""
+        with open(path, "rb") as file:
+            grid = read_native(file).grid
+        return cls(grid.range_steps, grid.texture, grid.spec.step_mm, grid.spec.geometry)
 
     def clicks(self, count: int) -> list[tuple[float, float]]:
-        """Places (u, v) on measured cells, spread evenly at random, the same every time."""
+        """Places (u, v) on measured cells, spread evenly at random, the same every time.
+
+        Of a sphere both poles come first.
+        """
         cells = np.argwhere(self.range_steps > 0)
-        chosen = cells[np.random.default_rng(SEED).integers(len(cells), size=count)]
         height, width = self.range_steps.shape
+        random = np.random.default_rng(SEED)
+        if self.geometry == "sphere":
+            narrow = np.sin(np.pi * (cells[:, 0] + 0.5) / height)
+            poles = np.array([[0, width // 2], [height - 1, 0]])
+            chosen = np.concatenate([poles, cells[random.choice(len(cells), count, p=narrow / narrow.sum())]])
+        else:
+            chosen = cells[random.integers(len(cells), size=count)]
         return [((column + 0.5) / width, (row + 0.5) / height) for row, column in chosen.tolist()]
 
     def compare(self, model: Model, u: float, v: float, window: float = WINDOW) -> dict[str, float | bool]:
@@ -48,7 +60,7 @@ class Truth:
         ok : both within DESIGN 8's target, and voids where the truth has them and nowhere else.
         """
         height, width = self.range_steps.shape
-        region = region_round(u, v, window, width, height)
+        region = region_on(model.spec, u, v, window, width, height)
         held, true = (steps[region.rows][:, region.columns] for steps in (model.range_steps, self.range_steps))
         measured = (held > 0) & (true > 0)
         error_mm = np.abs(held[measured].astype(np.int64) - true[measured]) * self.step_mm
@@ -60,7 +72,7 @@ class Truth:
 
     def _psnr_db(self, model: Model, u: float, v: float, window: float) -> float:
         height, width = self.texture.shape[:2]
-        region = region_round(u, v, window, width, height)
+        region = region_on(model.spec, u, v, window, width, height)
         held, true = (image[region.rows][:, region.columns] for image in (model.texture, self.texture))
         squared = float(np.mean((held.astype(np.float64) - true) ** 2))
         return PSNR_MAX_DB if squared == 0 else min(10 * math.log10(255**2 / squared), PSNR_MAX_DB)

@@ -20,7 +20,16 @@ from exchange.ends import POINTS, SIDES, End, find_end, lid_colours, paint_lid, 
 from exchange.errors import ExchangeError
 from exchange.profile import columns_mm, meet, profiles, sample_rows, strips
 from exchange.rays import LevelRays, StarRays
-from exchange.star import CANDIDATES, DEPTH_TOLERANCE, HIDDEN_MAX, INSIDE_MIN, NEAR_ENOUGH, nearest_round, solid_share
+from exchange.star import (
+    CANDIDATES,
+    DEPTH_TOLERANCE,
+    HIDDEN_MAX,
+    INSIDE_MIN,
+    NEAR_ENOUGH,
+    OPEN_MAX,
+    nearest_round,
+    solid_share,
+)
 from protocol.grid import HEIGHT_MAX, STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray
 from protocol.rings import thin_grid
 
@@ -28,6 +37,7 @@ COLUMNS_LOOKED_AT = 180  # tell where a centre may stand and how many rows are n
 EDGE_ON_ROWS = 4.0  # samples further apart than that, as the centre sees them, say little of what is between them
 ROWS_OF = 8  # rows come in whole blocks
 TEXEL_ROWS_OF = 16
+_NO_TEXTURE = np.zeros((1, 1, 3), np.uint8)
 
 Progress = Callable[[float], object]
 
@@ -106,9 +116,14 @@ def close_scan(
 
 
 def closes(grid: Grid) -> bool:
-    """Whether both ends of a cylinder are round: a closed object, seen from everywhere but straight up and down."""
-    ends = (find_end(grid.spec, grid.range_steps, side, cap=False) for side in SIDES)
-    return grid.spec.geometry == "cylinder" and all(end is not None for end in ends)
+    """Whether a cylinder is a closed object seen from nearly everywhere: OPEN_MAX void, HIDDEN_MAX hidden at most."""
+    every = max(1, grid.spec.width // COLUMNS_LOOKED_AT)
+    steps = np.ascontiguousarray(grid.range_steps[:, ::every])
+    few = Grid(replace(grid.spec, width=steps.shape[1], texture_width=1, texture_height=1), steps, _NO_TEXTURE)
+    try:
+        return close_scan(few)[1].open <= OPEN_MAX
+    except ExchangeError:
+        return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -109,7 +109,7 @@ class Library(Struct, frozen=True, forbid_unknown_fields=True):
     """[library]: where scans are kept, and as what."""
 
     folder: Annotated[str, Meta(min_length=1, max_length=4096)] = "~/.local/share/foveascan"  # ~ is the service's home
-    spheres: bool = True  # keep a sweep whose ends are round as a sphere, too
+    spheres: bool = True  # keep a sweep of a closed object as a sphere, too
 
     @property
     def path(self) -> Path:

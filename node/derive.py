@@ -1,8 +1,7 @@
 """Scans made of scans: a cylinder as a sphere, or a sphere as a cylinder, each kept as a scan of its own.
 
 A scan never changes, so what is made of it stands beside it, and says of which scans it was made and how. That happens
-when somebody asks, over HTTP, and by itself when both ends of a sweep are round: then its object is closed, and a
-client sees all of its sides, poles included.
+when somebody asks, over HTTP, and by itself with a sweep that saw nearly all of a closed object.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ class Derivation:
         return [web.post("/v1/scans/{scan}/derive", self._derive)]
 
     def consider(self, scan_id: str) -> None:
-        """Make a sphere of a new sweep, if its ends are round; later, beside everything else."""
+        """Make a sphere of a new sweep, if it saw a closed object; later, beside everything else."""
         task = asyncio.create_task(self._close(scan_id))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -38,7 +38,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
         "--specimen",
         default="head",
         metavar="NAME|FILE",
-        help="head, nutcracker, sphere, cylinder, or a .npz grid, mesh or Echo file (head)",
+        help="head, nutcracker, sphere, cylinder, pebble, or a .npz grid, mesh or Echo file (head)",
     )
     simulate.add_argument("--texture", type=Path, metavar="IMAGE", help="texture of a specimen from a file")
     simulate.add_argument("--size", choices=("S", "M", "L"), default="S", help="of a generated specimen or a mesh (S)")
@@ -66,6 +66,9 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     )
     simulate.add_argument("--serial-number", default="SIM-0001", help="of the scanner (SIM-0001)")
     simulate.add_argument("--truth", type=Path, metavar="FILE", help="write what the node should see, as a .npz grid")
+    simulate.add_argument(
+        "--closed", type=Path, metavar="FILE", help="write a closed specimen (pebble) whole, as a .npz grid of a sphere"
+    )
     simulate.add_argument("--json", action="store_true", help="print one JSON object a line")
     simulate.set_defaults(run=run_simulate)
 
@@ -79,9 +82,10 @@ def run_simulate(args: argparse.Namespace) -> int:
 
     specimen = make_specimen(args.specimen, args.size, args.texture, args.seed)
     scanner = _scanner(args, specimen)
-    if args.truth is not None:
-        with whole_file(args.truth) as file:
-            write_native(specimen.grid, file, specimen.name)
+    for path, grid in ((args.truth, specimen.grid), (args.closed, specimen.closed)):
+        if path is not None and grid is not None:
+            with whole_file(path) as file:
+                write_native(grid, file, specimen.name)
     portion = USB_PORTION_BYTES if args.link == "usb" else PORTION_BYTES
     with _port(args) as (port, about), _stopped_by_signals(port) as stop:
         print(_ready(args, specimen, about), flush=True)
@@ -136,7 +140,8 @@ def _ready(args: argparse.Namespace, specimen: Specimen, about: dict[str, Any]) 
     spec = specimen.grid.spec
     if args.json:
         shape = {"range": [spec.height, spec.width], "texture": [spec.texture_height, spec.texture_width]}
-        return json.dumps({"ready": True, "specimen": specimen.name, "shape": shape, **about})
+        is_closed = specimen.closed is not None
+        return json.dumps({"ready": True, "specimen": specimen.name, "shape": shape, "closed": is_closed, **about})
     said = (
         f"Scanner ready at {about['path']}: {specimen.name}, range {spec.width} x {spec.height}, "
         f"texture {spec.texture_width} x {spec.texture_height}"

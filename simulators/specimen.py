@@ -15,11 +15,13 @@ from types import MappingProxyType
 import numpy as np
 
 from exchange.formats import SIZES, ReadOptions, read_scan
+from exchange.unrolling import unroll
 from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from simulators import shapes
 from simulators.head import head
 from simulators.nutcracker import nutcracker
+from simulators.pebble import pebble
 
 GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType(
     {
@@ -27,6 +29,7 @@ GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType
         "cylinder": shapes.cylinder,
         "nutcracker": nutcracker,
         "head": head,
+        "pebble": pebble,
     }
 )
 ON_COLUMN = 1e-6
@@ -34,14 +37,19 @@ ON_COLUMN = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Specimen:
-    """An object with known truth. Its arrays are made read-only: nobody can change the truth while it is scanned."""
+    """An object with known truth. Its arrays are made read-only: nobody can change the truth while it is scanned.
+
+    grid : what the turntable sees of it.  closed : all of it, as a sphere; None of an object that is not known so.
+    """
 
     name: str
     grid: Grid
+    closed: Grid | None = None
 
     def __post_init__(self) -> None:
-        self.grid.range_steps.flags.writeable = False
-        self.grid.texture.flags.writeable = False
+        for grid in (self.grid, self.closed or self.grid):
+            grid.range_steps.flags.writeable = False
+            grid.texture.flags.writeable = False
 
     def range_column(self, angle_rad: float) -> StepArray:
         """Range seen at an angle. (H,) uint16 steps, 0 = void
@@ -81,14 +89,20 @@ def make_specimen(
         return _from_file(Path(name_or_path), size, None if texture_path is None else Path(texture_path))
     if texture_path is not None:
         raise ConfigError(f"texture: {name_or_path} brings its own; --texture goes with a file")
-    return Specimen(str(name_or_path), generate(SIZES[size], seed))
+    return _standing(str(name_or_path), generate(SIZES[size], seed))
 
 
 def _from_file(path: Path, size: str, texture_path: Path | None) -> Specimen:
     if not path.suffix and not path.exists():
         raise ConfigError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no file")
-    found = read_scan(path, texture_path, ReadOptions(SIZES[size], geometry="cylinder"))
-    return Specimen(found.name, found.grid)
+    as_it_is = path.suffix.lower() == ".npz"
+    found = read_scan(path, texture_path, ReadOptions(SIZES[size], geometry=None if as_it_is else "cylinder"))
+    return _standing(found.name, found.grid)
+
+
+def _standing(name: str, grid: Grid) -> Specimen:
+    """A grid as a specimen: of a closed object the turntable sees the sides."""
+    return Specimen(name, grid) if grid.spec.geometry == "cylinder" else Specimen(name, unroll(grid), grid)
 
 
 def _columns_about(angle_rad: float, theta0_rad: float, width: int) -> tuple[int, int, float]:

@@ -92,12 +92,16 @@ def test_nothing_is_made_up_that_was_not_asked_for() -> None:
     assert said.open == pytest.approx(1 - np.cos(np.arctan2(CAN_MM, CAN_HIGH_MM / 2)), abs=0.02)
 
 
-@pytest.mark.parametrize(("grid", "expected"), [(ball(), True), (can(), False)], ids=["ball", "can"])
-def test_round_ends_close_and_flat_ones_do_not(grid: Grid, expected: bool) -> None:
+@pytest.mark.parametrize(
+    ("grid", "expected"),
+    [(ball(), True), (can(), False), (with_void(ball(), slice(20), slice(None)), False), (nutcracker(SHAPE, 0), False)],
+    ids=["ball", "can", "ball without its top", "not star-shaped"],
+)
+def test_what_is_seen_from_nearly_everywhere_closes(grid: Grid, expected: bool) -> None:
     assert closes(grid) is expected
 
 
-def test_what_goes_on_beyond_the_scan_does_not_close() -> None:
+def test_what_goes_on_beyond_the_scan_has_no_round_end() -> None:
     whole = ball()
     spec = whole.spec
     cut = next(row for row in range(spec.height) if whole.range_steps[row].any())

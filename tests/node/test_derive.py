@@ -106,7 +106,7 @@ async def test_what_hides_much_of_itself_is_refused_with_a_cure(tmp_path: Path) 
         assert answer.status == 422 and "keep it as a cylinder" in await answer.text()
 
 
-async def test_a_sweep_with_round_ends_is_kept_as_a_sphere_too(tmp_path: Path) -> None:
+async def test_a_sweep_of_a_closed_object_is_kept_as_a_sphere_too(tmp_path: Path) -> None:
     async with node(tmp_path, BALL, CAN) as (_, server, library, ids):
         for scan in ids:
             server.swept(scan)

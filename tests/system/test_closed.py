@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from exchange.formats import read_scan
 from exchange.native import write_native
-from foveascan import main, started
+from foveascan import PROGRAM, main, started
 from simulators.shapes import cylinder
 
 
@@ -62,3 +63,15 @@ def test_what_cannot_be_made_is_told_with_its_cure(
     assert main(["import", str(tmp_path / "can.npz"), "--node", url]) == 0
     assert main([*command, "--node", url]) == 1
     assert cure in capsys.readouterr().err
+
+
+def test_the_demo_looks_at_both_poles_of_a_closed_object() -> None:
+    command = [*PROGRAM, "demo", "--specimen", "pebble", "--once", "--json"]
+    ran = subprocess.run(command, capture_output=True, timeout=300)
+    assert ran.returncode == 0, ran.stderr.decode()
+    said = json.loads(ran.stdout)
+    assert said["ok"] and said["closed"]["ok"] and said["scan"] != said["closed"]["scan"]
+    heights = [update["v"] for update in said["closed"]["updates"]]
+    assert heights[:2] == [0.005, 0.995] and len(heights) == 5
+    for update in said["closed"]["updates"]:
+        assert update["range_error_mm_p99"] <= 0.1 and update["texture_psnr_db"] >= 40
