@@ -10,8 +10,10 @@ import numpy as np
 
 from client.model import Model
 from exchange.native import read_native
-from protocol.grid import Geometry, ImageArray, StepArray
-from protocol.sphere import region_on
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, BoolArray, Geometry, ImageArray, StepArray
+from protocol.region import region_round
+from protocol.rings import ring_strides
+from protocol.sphere import cap_region
 
 SEED = 7
 WINDOW = 0.05
@@ -60,8 +62,8 @@ class Truth:
         ok : both within DESIGN 8's target, and voids where the truth has them and nowhere else.
         """
         height, width = self.range_steps.shape
-        region = region_on(model.spec, u, v, window, width, height)
-        held, true = (steps[region.rows][:, region.columns] for steps in (model.range_steps, self.range_steps))
+        inside = self._inside(u, v, window, height, width, RANGE_BLOCK)
+        held, true = model.range_steps[inside], self.range_steps[inside]
         measured = (held > 0) & (true > 0)
         error_mm = np.abs(held[measured].astype(np.int64) - true[measured]) * self.step_mm
         error = float(np.percentile(error_mm, PERCENTILE, method="higher")) if error_mm.size else 0.0
@@ -72,7 +74,16 @@ class Truth:
 
     def _psnr_db(self, model: Model, u: float, v: float, window: float) -> float:
         height, width = self.texture.shape[:2]
-        region = region_on(model.spec, u, v, window, width, height)
-        held, true = (image[region.rows][:, region.columns] for image in (model.texture, self.texture))
+        inside = self._inside(u, v, window, height, width, TEXTURE_BLOCK)
+        held, true = model.texture[inside], self.texture[inside]
         squared = float(np.mean((held.astype(np.float64) - true) ** 2))
         return PSNR_MAX_DB if squared == 0 else min(10 * math.log10(255**2 / squared), PSNR_MAX_DB)
+
+    def _inside(self, u: float, v: float, window: float, height: int, width: int, side: int) -> BoolArray:
+        """Cells of a window; on a sphere those that are samples of their own, since they are equally far apart."""
+        if self.geometry == "cylinder":
+            region = region_round(u, v, window, width, height)
+            return region.inside(np.arange(height), np.arange(width))
+        inside = cap_region(u, v, window, width, height).inside(np.arange(height), np.arange(width))
+        stride = np.repeat(ring_strides(width, height, side), side)[:height]
+        return np.asarray(inside & (np.arange(width) % stride[:, None] == 0))

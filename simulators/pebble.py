@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from protocol.grid import FloatArray, Grid, GridSpec
-from protocol.rings import thin_rings
+from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid, vectors
 from simulators.noise import Plane
 from simulators.shapes import STEP_MM, Shape
@@ -37,7 +37,7 @@ def pebble(shape: Shape, seed: int) -> Grid:
     texture = np.empty((texture_height, texture_width, 3), np.uint8)
     for rows, towards in _bands(texture_width, texture_height, spec.theta0_rad):
         texture[rows] = np.clip(np.rint(stone.colour(towards)), 0, 255)
-    return Grid(spec, thin_rings(steps), texture)
+    return thin_grid(Grid(spec, steps, texture))
 
 
 class Pebble:
