@@ -19,10 +19,10 @@ async function page(out) {
   await rm(out, { recursive: true, force: true });
   await mkdir(out, { recursive: true });
   const common = { ...COMMON, minify: true, platform: 'browser', external: ['fs', 'path'], outdir: out, metafile: true };
-  const worker = named((await build({ ...common, entryPoints: ['src/worker.ts'] })).metafile.outputs, 'src/worker.ts');
-  const define = { WORKER_FILE: JSON.stringify(worker) };
-  const outputs = (await build({ ...common, define, entryPoints: ['src/boot.ts', 'src/main.ts', 'src/style.css'] })).metafile.outputs;
-  const [boot, script, style] = ['boot.ts', 'main.ts', 'style.css'].map((entry) => named(outputs, `src/${entry}`));
+  const { outputs } = (await build({ ...common, entryPoints: ['src/worker.ts', 'src/main.ts', 'src/style.css'] })).metafile;
+  const [worker, script, style] = ['worker.ts', 'main.ts', 'style.css'].map((entry) => named(outputs, `src/${entry}`));
+  const define = { WORKER_FILE: JSON.stringify(worker), MAIN_FILE: JSON.stringify(script) };
+  const boot = named((await build({ ...common, define, entryPoints: ['src/boot.ts'] })).metafile.outputs, 'src/boot.ts');
   const names = { boot, script, style };
   const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name]);
   await writeFile(join(out, 'index.html'), html);

@@ -35,7 +35,7 @@ def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:
     """The scans asked for that are there, and why others are not. Raises ConfigError where none is."""
     from tests.bench.scans import STANDARD, Skipped, load
 
-    specimens = tuple(args.specimen or (("head",) if args.name == "line" else STANDARD))
+    specimens = tuple(args.specimen or (("head",) if args.name in ("line", "page") else STANDARD))
     if args.texture and len(specimens) != 1:
         raise ConfigError("bench: --texture goes with one --specimen FILE")
     scans, skipped = [], []
@@ -100,8 +100,17 @@ def _alpha(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     return record, alpha.told(record)
 
 
+def _page(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    import asyncio
+
+    from tests.bench import page
+
+    record = asyncio.run(page.run(scans[0], args.clicks, args.repeats, args.seconds))
+    return record, page.told(record)
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, list[BenchScan]], Told]] = {
-    "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate, "alpha": _alpha,
+    "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate, "alpha": _alpha, "page": _page,
 }  # fmt: skip
 
 
@@ -124,4 +133,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=REPEATS, metavar="N", help=f"of each timing ({REPEATS})")
     parser.add_argument("--rival", action="append", metavar="NAME", help="roi: only these rivals")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="roi: write PNGs of bytes against quality")
+    parser.add_argument("--seconds", type=float, default=60, metavar="S", help="page: of random clicks (60)")
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help="where rivals' results are kept")

@@ -39,6 +39,13 @@ class Looked:
 @asynccontextmanager
 async def node_with(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[Session, dict[str, str]]]:
     """A session with a running node, and the id of each scan by its key."""
+    async with node_at(scans) as (_, session, ids):
+        yield session, ids
+
+
+@asynccontextmanager
+async def node_at(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[str, Session, dict[str, str]]]:
+    """The same, and where it is."""
     with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
         ids = {scan.key: scan.published(Path(folder)).id for scan in scans}
         arguments = ("serve", "--library", folder, "--listen", "127.0.0.1:0", "--insecure", "--json")
@@ -47,7 +54,7 @@ async def node_with(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[Session, 
                 for scan_id in ids.values():
                     await session.open(scan_id)
                 await _surveyed(ready["url"])
-                yield session, ids
+                yield ready["url"], session, ids
 
 
 async def _surveyed(url: str) -> None:

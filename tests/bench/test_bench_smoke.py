@@ -1,12 +1,13 @@
 """The benchmarks run: one small scan, one click, a rival that needs no long search. Figures are not judged here."""
 
+import asyncio
 import json
 
 import numpy as np
 import pytest
 
 import foveascan
-from tests.bench import alpha, codec, line, rate, roi
+from tests.bench import alpha, codec, line, page, rate, roi
 from tests.bench.cache import Cache
 from tests.bench.rivals.offer import straight
 from tests.bench.scans import BenchScan, load
@@ -46,6 +47,14 @@ def test_alpha_compares_profiles_at_equal_bytes(scan: BenchScan, monkeypatch: py
     thin, wide, _ = record["rows"]
     assert thin["window_db"] > wide["window_db"]
     assert alpha.told(record)
+
+
+def test_the_page_is_measured_beside_an_empty_one(scan: BenchScan) -> None:
+    record = asyncio.run(page.run(scan, 2, 1, 1.0))
+    assert record["first"]["ms"] > 0 < record["first"]["empty_ms"]
+    assert record["click"]["count"]
+    assert len(record["memory"]["mb"]["renderer process"]) == page.ROUNDS + 1
+    assert page.told(record)
 
 
 def test_an_image_is_most_similar_to_itself() -> None:

@@ -24,6 +24,7 @@ import type { Place } from './view/pick.ts';
 import { Stage } from './view/stage.ts';
 
 const CAPTURE_MS = 2000;
+const WRITE_MS = 200;
 
 export class App {
   private readonly frame: Frame;
@@ -46,13 +47,16 @@ export class App {
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
   private measured: Place[] = [];
+  private writing: ReturnType<typeof setTimeout> | undefined;
 
-  constructor(root: HTMLElement, private readonly worker: Worker) {
+  constructor(
+    root: HTMLElement, private readonly worker: Worker, private readonly canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
+  ) {
     const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
-    this.frame = new Frame(root, {
+    this.frame = new Frame(root, canvas, {
       retry: () => this.tell({ kind: 'retry' }), zoom: (steps) => this.stage.zoom(steps), home: () => this.home(),
     });
-    this.stage = new Stage(this.frame.canvas, {
+    this.stage = new Stage(canvas, context, {
       drawn: () => this.marks?.update(),
       settled: () => this.writeState(),
       lost: () => this.frame.say(strings.link.graphicsLost),
@@ -223,7 +227,7 @@ export class App {
   }
 
   private listen(): void {
-    listen(this.frame.canvas, {
+    listen(this.canvas, {
       click: (x, y) => this.click(x, y),
       hover: (x, y) => this.hover(x, y),
       turn: (across, up) => this.stage.turn(across, up),
@@ -372,10 +376,14 @@ export class App {
 
   // The address
 
+  /** Soon, and once for any number of calls: browsers take it slowly, and not too often. */
   private writeState(): void {
-    if (!this.info || this.sweep.isWatched) return;
-    const fragment = formatState({ ...this.state, scan: this.info.id, camera: this.stage.placed });
-    history.replaceState(null, '', `#${fragment}`);
+    this.writing ??= setTimeout(() => {
+      this.writing = undefined;
+      if (!this.info || this.sweep.isWatched) return;
+      const fragment = formatState({ ...this.state, scan: this.info.id, camera: this.stage.placed });
+      history.replaceState(null, '', `#${fragment}`);
+    }, WRITE_MS);
   }
 
   private addressChanged(): void {

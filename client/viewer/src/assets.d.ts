@@ -18,7 +18,8 @@ declare module '@cornerstonejs/codec-openjph' {
     HTJ2KDecoder: new () => Decoder;
   }
   export interface Options {
-    wasmBinary: ArrayBuffer;
+    wasmBinary?: ArrayBuffer;
+    locateFile?: () => string;
     print: (line: string) => void;
     printErr: (line: string) => void;
   }
@@ -30,5 +31,6 @@ declare module '@cornerstonejs/codec-openjph/wasm' {
   export default path;
 }
 
-/** Name of the worker's script, which the build writes in. */
+/** Names of other scripts, which the build writes in. */
 declare const WORKER_FILE: string;
+declare const MAIN_FILE: string;

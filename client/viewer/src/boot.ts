@@ -1,10 +1,18 @@
-// Runs before everything else, so that the stream is open by the time the rest of the page is compiled.
+// Runs before everything else, and sets going what takes long elsewhere: the worker with its stream, and the graphics
+// context. A worker starts with the help of this thread, so the large rest of the page is not run before it has.
 
+import { CONTEXT } from './link.ts';
 import type { FromWorker } from './link.ts';
 import { parseState } from './url_state.ts';
 
 const worker = new Worker(new URL(WORKER_FILE, import.meta.url), { type: 'module' });
 const said: MessageEvent<FromWorker>[] = [];
-worker.onmessage = (event: MessageEvent<FromWorker>) => said.push(event);
+const started = new Promise((resolve) => {
+  worker.onmessage = (event: MessageEvent<FromWorker>) => resolve(said.push(event));
+});
 worker.postMessage({ kind: 'start', origin: location.origin, scan: parseState(location.hash.slice(1)).scan ?? 'latest' });
-Object.assign(globalThis, { boot: { worker, said } });
+const canvas = document.createElement('canvas');
+const context = canvas.getContext('webgl2', CONTEXT);
+await started;
+const { main } = (await import(new URL(MAIN_FILE, import.meta.url).href)) as typeof import('./main.ts');
+setTimeout(() => main({ worker, said, canvas, context }));

@@ -22,6 +22,17 @@ export type ToWorker =
   | { kind: 'retry' }
   | { kind: 'thumbnail'; scan: string };
 
+/** What is begun before the page's own script runs. said: what the worker has said meanwhile. */
+export interface Boot {
+  worker: Worker;
+  said: MessageEvent<FromWorker>[];
+  canvas: HTMLCanvasElement;
+  context: WebGL2RenderingContext | null;
+}
+
+/** Edges are smooth because the picture is drawn larger than shown. */
+export const CONTEXT: WebGLContextAttributes = { antialias: false, powerPreference: 'high-performance' };
+
 /** A scan as it is known now; texels that are refined follow as patches. */
 export interface Snapshot {
   info: ScanInfo;
@@ -48,7 +59,7 @@ export type LinkState =
 
 export type FromWorker =
   | { kind: 'link'; link: LinkState }
-  | { kind: 'opened'; snapshot: Snapshot; fresh: boolean; bytes: number }
+  | { kind: 'opened'; snapshot: Snapshot; fresh: boolean }
   | { kind: 'restored' }
   | { kind: 'patch'; channel: Channel; changed: Changed[]; level: Uint8Array }
   | { kind: 'updated'; answer: Answer }

@@ -42,7 +42,6 @@ export class Stream {
   private opening = 0;
   private looking: Looking | null = null;
   private applyMs = 0;
-  private firstBytes = 0;
   private received = 0;
   private sent = 0;
   private picture: LivePicture | null = null;
@@ -96,7 +95,7 @@ export class Stream {
   restore(): void {
     this.work = this.work.then(() => {
       if (!this.model?.complete) return;
-      this.tell({ kind: 'opened', snapshot: snapshotOf(this.model), fresh: false, bytes: 0 });
+      this.tellSnapshot(this.model, false);
       if (this.model.hasTexels) this.tellAllTexels(this.model);
       this.tell({ kind: 'restored' });
     });
@@ -164,7 +163,6 @@ export class Stream {
     }
     this.wanted = scan.id;
     this.model = new Model(scan, epoch);
-    this.firstBytes = 0;
   }
 
   private async refine(refinement: Refinement, size: number): Promise<void> {
@@ -182,7 +180,7 @@ export class Stream {
     }
     const applyMs = performance.now() - began;
     this.applyMs += applyMs;
-    if (refinement.generator === COARSE) return this.firstView(model, size);
+    if (refinement.generator === COARSE) return this.firstView(model);
     if (this.looking && refinement.look === this.request) {
       this.looking.bytes += size;
       this.looking.applyMs += applyMs;
@@ -192,11 +190,10 @@ export class Stream {
     this.tell({ kind: 'patch', channel, changed, level }, changed.map(({ cells }) => cells.buffer as ArrayBuffer));
   }
 
-  private firstView(model: Model, size: number): void {
-    this.firstBytes += size;
+  private firstView(model: Model): void {
     if (!model.complete) return;
     this.acknowledge(model);
-    this.tell({ kind: 'opened', snapshot: snapshotOf(model), fresh: true, bytes: this.firstBytes });
+    this.tellSnapshot(model, true);
     if (this.looking) this.sendLook();
   }
 
@@ -229,7 +226,8 @@ export class Stream {
     this.pictureTimer ??= setTimeout(() => {
       this.pictureTimer = undefined;
       if (this.picture) {
-        this.tell({ kind: 'livePicture', steps: this.picture.steps.slice(), texels: this.picture.texels.slice() });
+        const [steps, texels] = [this.picture.steps.slice(), this.picture.texels.slice()];
+        this.tell({ kind: 'livePicture', steps, texels }, [steps.buffer, texels.buffer]);
       }
     }, PICTURE_MS);
   }
@@ -288,6 +286,12 @@ export class Stream {
     this.tell({ kind: 'link', link });
   }
 
+  private tellSnapshot(model: Model, fresh: boolean): void {
+    const [range, texture] = CHANNELS.map((channel) => model.holdings.channels[channel].level.slice());
+    const snapshot = { info: model.info, steps: model.steps.slice(), coarseTexels: model.coarseTexels.slice(), levels: [range!, texture!] } as Snapshot;
+    this.tell({ kind: 'opened', snapshot, fresh }, [snapshot.steps.buffer as ArrayBuffer, snapshot.coarseTexels.buffer as ArrayBuffer]);
+  }
+
   private tellAllTexels(model: Model): void {
     const { textureWidth: width, textureHeight: height } = model.info;
     const level = model.holdings.channels[TEXTURE].level.slice();
@@ -298,12 +302,3 @@ export class Stream {
     }
   }
 }
-
-function snapshotOf(model: Model): Snapshot {
-  const [range, texture] = CHANNELS.map((channel) => model.holdings.channels[channel].level.slice());
-  return {
-    info: model.info, steps: model.steps.slice(), coarseTexels: model.coarseTexels.slice(),
-    levels: [range!, texture!],
-  };
-}
-

@@ -21,9 +21,7 @@ interface Scope {
 const scope = globalThis as unknown as Scope;
 
 // Asked for at once, so that it comes beside the first view.
-const htj2k = fetch(new URL(wasmPath, scope.location.href))
-  .then((response) => response.arrayBuffer())
-  .then((binary) => Htj2kDecoder.load(binary));
+const htj2k = Htj2kDecoder.load(new URL(wasmPath, scope.location.href).href);
 htj2k.catch(() => undefined); // whoever awaits it hears of it
 const codecs = new Codecs(() => htj2k, decodeJpegNatively);
 

@@ -5,12 +5,13 @@ import { backoffMs } from '../src/backoff.ts';
 import { formatState, parseState } from '../src/url_state.ts';
 import { boundsOf, fittingDistance } from '../src/view/framing.ts';
 import { locate, pick } from '../src/view/pick.ts';
-import { STRIDES, TILE, Tiles } from '../src/view/tiles.ts';
+import { STRIDES, Tiles } from '../src/view/tiles.ts';
 
 const INFO = {
   id: 'a', width: 360, height: 200, textureWidth: 720, textureHeight: 400, coarseWidth: 45, coarseHeight: 25,
   coarseTextureWidth: 90, coarseTextureHeight: 50, stepMm: 0.01, pitchMm: 1, zMaxMm: 100, theta0Rad: 0.3,
 };
+const TILE = 64;
 const cylinder = (radiusMm: number) => new Uint16Array(INFO.width * INFO.height).fill(radiusMm / INFO.stepMm);
 
 test('an address holds a view, and nonsense in it is left out', () => {
@@ -57,13 +58,13 @@ test('everything fits the picture, however narrow', () => {
 });
 
 test('neighbouring tiles share every vertex of their border', () => {
-  const tiles = new Tiles(INFO);
+  const tiles = new Tiles(INFO, TILE);
   tiles.update(cylinder(50), new Uint8Array(45 * 25).map((_, block) => (block % 45 < 24 ? 0 : 6)));
   const camera = new PerspectiveCamera(28, 1, 1, 1000);
   camera.position.set(-500, 0, 0);
   camera.lookAt(0, 0, 0);
   camera.updateMatrixWorld();
-  const { batches } = tiles.choose(camera, 700, { cellPx: 1, trianglesMax: 1e6 });
+  const { batches } = tiles.choose(camera, 700, { tileSide: TILE, cellPx: 1, trianglesMax: 1e6 });
   assert.ok(batches.filter(({ corners }) => corners.length).length > 1, 'several strides are drawn');
   const drawn = new Map<string, { stride: number; right: number; left: number }>();
   batches.forEach(({ corners, edges }, index) => {

@@ -44,7 +44,7 @@ def test_a_click_sharpens_what_it_is_at(browser: Browser, node: RunningNode) -> 
         click(page, *click_at)
         wait_updates(page, 1)
         sharp = crop(page, *click_at, 90)
-        everything(page)
+        exactly(page)
         click(page, *click_at)
         wait_updates(page, 2)
         full = crop(page, *click_at, 90)
@@ -244,10 +244,10 @@ def watch_a_sweep(page: Page) -> None:
     assert psnr(crop(page, 0.5, 0.45, 200), empty) < 25
 
 
-def everything(page: Page) -> None:
-    """Ask the next click for the whole scan, exactly."""
+def exactly(page: Page) -> None:
+    """Ask the next click for all that the scan has, in an area larger than any crop here."""
     page.get_by_label("Quality", exact=True).select_option("exact")
-    page.get_by_label("Area round the click").select_option("1")
+    page.get_by_label("Area round the click").select_option("0.15")
 
 
 def tab_to(page: Page, selector: str) -> None:

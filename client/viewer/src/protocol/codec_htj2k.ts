@@ -19,12 +19,14 @@ export interface ImageShape {
   components: 1 | 3;
 }
 
-/** Decodes through OpenJPH, compiled once from the bytes or the fetched module of its WASM. */
+/** Decodes through OpenJPH, compiled once. */
 export class Htj2kDecoder {
   private constructor(private readonly decoder: Decoder) {}
 
-  static async load(wasmBinary: ArrayBuffer): Promise<Htj2kDecoder> {
-    const module = await createOpenJph({ wasmBinary, print: () => undefined, printErr: () => undefined });
+  /** wasm: its bytes, or the address to compile it from while it comes. */
+  static async load(wasm: ArrayBuffer | string): Promise<Htj2kDecoder> {
+    const source = typeof wasm === 'string' ? { locateFile: () => wasm } : { wasmBinary: wasm };
+    const module = await createOpenJph({ ...source, print: () => undefined, printErr: () => undefined });
     return new Htj2kDecoder(new module.HTJ2KDecoder());
   }
 

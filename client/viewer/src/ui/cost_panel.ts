@@ -19,6 +19,7 @@ export class CostPanel {
   private plots: [uPlot, uPlot] | null = null;
   private total = 0;
   private counted = 0;
+  private inView = false;
 
   constructor() {
     const { cost } = strings;
@@ -27,8 +28,8 @@ export class CostPanel {
       h('figure', {}, h('figcaption', {}, cost.bandwidth), this.charts[0]),
       h('figure', {}, h('figcaption', {}, cost.chartQuality), this.charts[1]),
     );
-    this.element.addEventListener('toggle', () => this.plot());
     setInterval(() => this.tick(), 1000);
+    new IntersectionObserver(([entry]) => (this.inView = entry!.isIntersecting)).observe(this.charts[0]);
     new ResizeObserver(() => this.resize()).observe(this.charts[0]);
   }
 
@@ -44,18 +45,17 @@ export class CostPanel {
     if (textureDb === null) return;
     this.qualities.push([performance.now() / 1000, Math.min(textureDb, 99)]);
     if (this.qualities.length > ANSWERS_MAX) this.qualities.shift();
-    this.draw();
   }
 
   private tick(): void {
     this.perSecond.shift();
     this.perSecond.push((this.total - this.counted) / 1000);
     this.counted = this.total;
-    this.draw();
+    if (this.inView) this.draw();
   }
 
-  private plot(): void {
-    if (this.plots || !this.element.open || !this.charts[0].clientWidth) return;
+  /** The charts; made when they are first seen, since that takes a while. */
+  private plot(): [uPlot, uPlot] {
     const { cost } = strings;
     const colour = getComputedStyle(this.element).getPropertyValue('--pico-primary').trim() || '#06c';
     const ink = getComputedStyle(this.element).getPropertyValue('--quiet').trim() || '#777';
@@ -64,16 +64,14 @@ export class CostPanel {
       width: this.charts[0].clientWidth, height: CHART_HEIGHT, legend: { show: false }, cursor: { show: false },
       scales: { x: { time: false } }, axes: [axes[0]!, { ...axes[1]!, label: '' }], series: [{}, { label, stroke: colour, width: 1.5, ...series }],
     });
-    this.plots = [
+    return [
       new uPlot({ ...options(cost.kilobytes, { fill: `${colour}33`, points: { show: false } }), scales: { x: { time: false }, y: { range: (_u, _min, max) => [0, Math.max(max, 10)] } } }, [[], []], this.charts[0]),
       new uPlot({ ...options(cost.decibel, { points: { show: true, size: 6 } }), scales: { x: { time: false, range: () => [1 - SECONDS, 0] }, y: { range: [20, 60] } } }, [[], []], this.charts[1]),
     ];
-    this.draw();
   }
 
   private draw(): void {
-    this.plot();
-    if (!this.plots || !this.element.open) return;
+    this.plots ??= this.plot();
     this.plots[0].setData([this.perSecond.map((_, index) => index - SECONDS + 1), this.perSecond]);
     this.plots[1].setData([this.qualities.map(([at]) => at - performance.now() / 1000), this.qualities.map(([, db]) => Math.min(db, 60))]);
   }

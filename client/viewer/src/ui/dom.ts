@@ -8,12 +8,17 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   tag: K, attributes: Attributes = {}, ...children: Child[]
 ): HTMLElementTagNameMap[K] {
   const element = document.createElement(tag);
+  assign(element, attributes);
+  element.append(...children.filter((child): child is Node | string => child !== null));
+  return element;
+}
+
+/** Give an element attributes. */
+export function assign(element: Element, attributes: Attributes): void {
   for (const [name, value] of Object.entries(attributes)) {
     if (typeof value === 'function') element.addEventListener(name, value);
     else if (value !== null && value !== false) element.setAttribute(name, value === true ? '' : String(value));
   }
-  element.append(...children.filter((child): child is Node | string => child !== null));
-  return element;
 }
 
 let choices = 0;

@@ -64,8 +64,9 @@ export class ScanList {
   }
 }
 
+/** By the processor: a small picture is not worth a context on the graphics card. */
 function paint(canvas: HTMLCanvasElement, { side, pixels }: Picture): void {
-  canvas.getContext('2d')!.putImageData(new ImageData(pixels, side, side), 0, 0);
+  canvas.getContext('2d', { willReadFrequently: true })!.putImageData(new ImageData(pixels, side, side), 0, 0);
 }
 
 function when(unixS: number): string {

@@ -155,11 +155,13 @@ void main() {
 
 /**
  * Normals of range samples, (outward, round, up) and whether there is one, both times that. Differences are taken over
- * the spacing held, so that what was interpolated between coarse samples looks as smooth as it is.
+ * the spacing held, so that what was interpolated between coarse samples looks as smooth as it is. uCell: samples that
+ * one normal stands for.
  */
 export const NORMALS_FRAGMENT = /* glsl */ `
 ${GRID}
 uniform usampler2D uLevel;
+uniform vec2 uCell;
 out vec4 packed;
 
 int levelAt(int column, int row) {
@@ -180,7 +182,7 @@ float slope(int column, int row, int dx, int dy, int level, float here) {
 }
 
 void main() {
-  ivec2 at = ivec2(gl_FragCoord.xy);
+  ivec2 at = ivec2(gl_FragCoord.xy * uCell);
   float here = float(stepsAt(at.x, at.y));
   if (here == 0.0) {
     packed = vec4(0.0);
@@ -192,5 +194,17 @@ void main() {
   float downSlope = slope(at.x, at.y, 0, reach, level, here) * uStepMm / uPitchMm;
   vec3 normal = normalize(vec3(1.0, -roundSlope, downSlope));
   packed = vec4(normal * 0.5 + 0.5, 1.0);
+}
+`;
+
+/** A texture, stretched over a larger one. */
+export const COPY_FRAGMENT = /* glsl */ `
+precision highp float;
+uniform sampler2D uFrom;
+uniform ivec2 uSize;
+out vec4 copied;
+
+void main() {
+  copied = texture(uFrom, gl_FragCoord.xy / vec2(uSize));
 }
 `;

@@ -6,6 +6,7 @@ import type { Snapshot } from '../link.ts';
 import type { Channel } from '../protocol/lattice.ts';
 import type { Changed } from '../protocol/model.ts';
 import { FACING_RAD } from '../facing.ts';
+import { cardIsDone } from './compile.ts';
 import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
 import { locate, pick } from './pick.ts';
 import type { Place } from './pick.ts';
@@ -13,13 +14,15 @@ import { Surface } from './surface.ts';
 import type { Shading } from './surface.ts';
 import type { Detail } from './tiles.ts';
 
-const HARDWARE: Detail = { cellPx: 2, trianglesMax: 3e6 };
-const SOFTWARE: Detail = { cellPx: 7, trianglesMax: 1.5e5 };
+const HARDWARE: Detail = { tileSide: 64, cellPx: 2, trianglesMax: 3e6 };
+/** Fewer, larger tiles: a processor spends more on each one than on its triangles. */
+const SOFTWARE: Detail = { tileSide: 128, cellPx: 7, trianglesMax: 1.5e5 };
 /** Drawn larger than shown, so that edges are smooth. */
 const SMOOTH_RATIO = 1.5;
 const SLOW_FRAME_MS = 40;
 const QUICK_FRAME_MS = 22;
 const PACE_MAX = 6;
+const LEISURE_MS = 300;
 const TURN_STEP_RAD = Math.PI / 24;
 const ZOOM_STEP = 1.2;
 
@@ -42,7 +45,8 @@ export interface StageEvents {
 }
 
 export class Stage {
-  readonly software: boolean;
+  private readonly software: boolean;
+  private readonly detail: Detail;
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly camera = new PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 1, 1000);
@@ -52,15 +56,22 @@ export class Stage {
   private readonly retired: Surface[] = [];
   private shading: Shading = 'lit';
   private overlay: Channel | null = null;
+  /** Until programs are compiled, nothing can be drawn without waiting for them. */
+  private isWarm = false;
   private asked = false;
   private moving = false;
   private pace = 1;
   private lastMs = 0;
+  private leisure: ReturnType<typeof setTimeout> | undefined;
   private settling: ReturnType<typeof setTimeout> | undefined;
 
-  constructor(private readonly canvas: HTMLCanvasElement, private readonly events: StageEvents, calm: boolean) {
-    this.renderer = new WebGLRenderer({ canvas, alpha: true, powerPreference: 'high-performance' });
-    this.software = drawsInSoftware(this.renderer.getContext());
+  constructor(
+    private readonly canvas: HTMLCanvasElement, context: WebGL2RenderingContext, private readonly events: StageEvents, calm: boolean,
+  ) {
+    this.renderer = new WebGLRenderer({ canvas, context, alpha: true });
+    this.renderer.debug.checkShaderErrors = false; // asking waits for the compiler
+    this.software = drawsInSoftware(context);
+    this.detail = this.software ? SOFTWARE : HARDWARE;
     this.renderer.setClearColor(0, 0);
     this.controls = new OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: !calm, dampingFactor: 0.12, zoomToCursor: true, rotateSpeed: 0.7 });
@@ -74,14 +85,13 @@ export class Stage {
     });
     canvas.addEventListener('webglcontextrestored', () => this.events.restored());
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement!);
-    this.resize();
-    this.show(nothing(), false);
+    void this.warm();
   }
 
   /** Show a scan. framed: with the camera where it sees everything; else it stays. */
-  show({ info, ...state }: Snapshot, framed: boolean): void {
+  show(snapshot: Snapshot, framed: boolean): void {
     const old = this.surface;
-    this.surface = new Surface(this.renderer, info, state, !this.software);
+    this.surface = this.surfaceOf(snapshot);
     this.surface.show(this.shading, this.overlay);
     this.scene.add(this.surface.object);
     if (old) {
@@ -220,9 +230,30 @@ export class Stage {
     return { x, y, hidden: outside || this.hides(point) };
   }
 
+  private async useLeisure(): Promise<void> {
+    await cardIsDone(this.renderer);
+    this.surface?.makeReady();
+  }
+
+  /** Draw the smallest of surfaces, so that programs are there, and the card knows them, before a scan is. */
+  private async warm(): Promise<void> {
+    const first = this.surfaceOf(nothing());
+    await first.compile(this.camera);
+    first.prepare(this.camera, 1, this.detail);
+    this.renderer.render(first.object, this.camera);
+    first.makeReady();
+    this.retired.push(first);
+    this.isWarm = true;
+    this.draw();
+  }
+
+  private surfaceOf({ info, ...state }: Snapshot): Surface {
+    return new Surface(this.renderer, info, state, !this.software, this.detail.tileSide);
+  }
+
   /** Ask for a picture; any number of calls make one. */
   draw(): void {
-    if (this.asked) return;
+    if (this.asked || !this.isWarm) return;
     this.asked = true;
     requestAnimationFrame((nowMs) => this.paint(nowMs));
   }
@@ -231,8 +262,7 @@ export class Stage {
     this.asked = false;
     if (this.controls.enableDamping) this.controls.update();
     this.keepPace(nowMs);
-    const base = this.software ? SOFTWARE : HARDWARE;
-    const detail = this.moving ? { ...base, cellPx: base.cellPx * this.pace } : base;
+    const detail = this.moving ? { ...this.detail, cellPx: this.detail.cellPx * this.pace } : this.detail;
     const distance = this.camera.position.distanceTo(this.controls.target);
     this.camera.near = Math.max(distance / 400, 0.05);
     this.camera.far = distance + 2e3;
@@ -241,6 +271,8 @@ export class Stage {
     const ratio = this.renderer.getPixelRatio();
     const triangles = this.surface?.prepare(this.camera, this.canvas.clientHeight * ratio, detail) ?? 0;
     this.renderer.render(this.scene, this.camera);
+    clearTimeout(this.leisure);
+    this.leisure = setTimeout(() => void this.useLeisure(), LEISURE_MS);
     for (const old of this.retired.splice(0)) old.dispose();
     const { dataset } = this.canvas;
     dataset['drawn'] = String(Number(dataset['drawn'] ?? 0) + 1);
@@ -290,17 +322,17 @@ export class Stage {
 }
 
 /** Whether the processor draws, because there is no graphics card. */
-function drawsInSoftware(context: WebGLRenderingContext | WebGL2RenderingContext): boolean {
+function drawsInSoftware(context: WebGL2RenderingContext): boolean {
   const named = context.getExtension('WEBGL_debug_renderer_info');
   const name = String(context.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : context.RENDERER));
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
-/** The smallest scan: drawn before the first real one, so that the card has compiled everything when that comes. */
+/** The smallest scan, as coarse as a first view. */
 function nothing(): Snapshot {
   const info = {
     id: '', width: 8, height: 8, textureWidth: 16, textureHeight: 16, coarseWidth: 1, coarseHeight: 1, coarseTextureWidth: 1,
     coarseTextureHeight: 1, stepMm: 1, pitchMm: 1, zMaxMm: 4, theta0Rad: 0,
   };
-  return { info, steps: new Uint16Array(64).fill(1), coarseTexels: new Uint8Array(4), levels: [new Uint8Array(1), new Uint8Array(1)] };
+  return { info, steps: new Uint16Array(64).fill(1), coarseTexels: new Uint8Array(4), levels: [new Uint8Array(1).fill(6), new Uint8Array(1).fill(6)] };
 }

@@ -1,10 +1,9 @@
 // One scan on the graphics card: range, normals, colour and levels as textures, drawn in tiles.
 
 import {
-  BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, DataTexture, DoubleSide, DynamicDrawUsage, GLSL3, Group,
-  InstancedBufferAttribute, InstancedBufferGeometry, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, NoBlending,
-  NoColorSpace, RedIntegerFormat, RepeatWrapping, RGBAFormat, Scene, ShaderMaterial, UnsignedByteType,
-  UnsignedShortType, Vector2, Vector3, WebGLRenderTarget,
+  BufferAttribute, ClampToEdgeWrapping, DataTexture, DoubleSide, DynamicDrawUsage, GLSL3, Group, InstancedBufferAttribute,
+  InstancedBufferGeometry, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, NoBlending, NoColorSpace,
+  RedIntegerFormat, RepeatWrapping, RGBAFormat, ShaderMaterial, UnsignedByteType, UnsignedShortType, Vector2, Vector3,
 } from 'three';
 import type { IUniform, PerspectiveCamera, Texture, WebGLRenderer } from 'three';
 import type { Snapshot } from '../link.ts';
@@ -12,16 +11,16 @@ import { RANGE, TEXTURE } from '../protocol/lattice.ts';
 import type { Channel } from '../protocol/lattice.ts';
 import type { ScanInfo } from '../protocol/messages.ts';
 import type { Changed } from '../protocol/model.ts';
-import { NORMALS_FRAGMENT, QUAD_VERTEX, SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
-import { STRIDES, TILE, Tiles } from './tiles.ts';
+import { compile } from './compile.ts';
+import { Normals } from './normals.ts';
+import { SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
+import { STRIDES, Tiles } from './tiles.ts';
 import type { Detail } from './tiles.ts';
 
 export const SHADINGS = ['lit', 'relief', 'flat'] as const;
 export type Shading = (typeof SHADINGS)[number];
 const RANGE_BLOCK = 8;
 const TEXTURE_BLOCK = 16;
-/** Differences of a normal reach this far beyond the samples that changed. */
-const NORMAL_REACH = 24;
 
 type Uniforms = Record<string, IUniform>;
 
@@ -36,13 +35,12 @@ export class Surface {
   private readonly levels: [range: DataTexture, texture: DataTexture];
   private readonly coarse: DataTexture;
   private dense: DataTexture;
-  private readonly normals: WebGLRenderTarget;
-  private readonly normalPass: { scene: Scene; camera: Camera };
+  private readonly normals: Normals;
   private readonly uniforms: Uniforms;
 
   constructor(
     private readonly renderer: WebGLRenderer, readonly info: ScanInfo, snapshot: Omit<Snapshot, 'info'>,
-    private readonly mipmaps: boolean,
+    private readonly mipmaps: boolean, tileSide: number,
   ) {
     const { width, height } = info;
     const most = renderer.capabilities.maxTextureSize;
@@ -56,23 +54,28 @@ export class Surface {
     ];
     this.coarse = colours(snapshot.coarseTexels, info.coarseTextureWidth, info.coarseTextureHeight);
     this.dense = colours(new Uint8Array(4), 1, 1);
-    this.normals = new WebGLRenderTarget(width, height, {
-      depthBuffer: false, wrapS: RepeatWrapping, wrapT: ClampToEdgeWrapping, minFilter: LinearFilter, magFilter: LinearFilter,
-      generateMipmaps: false,
-    });
     this.uniforms = {
       uRange: { value: this.range }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
       uPitchMm: { value: info.pitchMm }, uZMaxMm: { value: info.zMaxMm }, uTheta0: { value: info.theta0Rad },
-      uTile: { value: TILE }, uNormals: { value: this.normals.texture }, uCoarse: { value: this.coarse },
+      uTile: { value: tileSide }, uNormals: { value: null }, uCoarse: { value: this.coarse },
       uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
       uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
     };
-    this.tiles = new Tiles(info);
-    this.meshes = STRIDES.map((stride) => tileMesh(stride, this.tiles.count, this.uniforms));
+    this.tiles = new Tiles(info, tileSide);
+    this.meshes = STRIDES.map((stride) => tileMesh(tileSide, stride, this.tiles.count, this.uniforms));
     this.object.add(...this.meshes);
-    this.normalPass = quadPass(this.uniforms, this.levels[0]);
     this.tiles.update(this.steps, snapshot.levels[0]);
-    this.drawNormals({ x: 0, y: 0, width, height });
+    this.normals = new Normals(renderer, width, height, this.uniforms, this.levels[0], spacingOf(snapshot.levels[0]));
+  }
+
+  /** Have all programs compiled; meanwhile nothing is drawn. */
+  async compile(camera: PerspectiveCamera): Promise<void> {
+    await Promise.all([compile(this.renderer, this.object, camera), this.normals.compile()]);
+  }
+
+  /** Do what the first picture could do without, so that the first look need not wait for it. */
+  makeReady(): void {
+    this.normals.fill();
   }
 
   /** Take rectangles that have changed, and the levels then held. */
@@ -90,7 +93,7 @@ export class Surface {
     (this.coarse.image.data as Uint8Array).set(coarseTexels);
     this.range.needsUpdate = this.coarse.needsUpdate = true;
     this.tiles.update(this.steps, this.levels[0].image.data as Uint8Array);
-    this.drawNormals({ x: 0, y: 0, width: this.info.width, height: this.info.height });
+    this.normals.changeAll();
   }
 
   /** How to shade, and whose spacing to lay over it. */
@@ -106,6 +109,7 @@ export class Surface {
 
   /** Choose tiles for a camera and light them from it. Returns the triangles to be drawn. */
   prepare(camera: PerspectiveCamera, sidePx: number, detail: Detail): number {
+    this.normals.drawDue();
     const { batches, triangles } = this.tiles.choose(camera, sidePx, detail);
     this.meshes.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.corners, batches[index]!.edges));
     (this.uniforms['uKey']!.value as Vector3).set(-0.45, 0.55, 0.8).normalize().transformDirection(camera.matrixWorld);
@@ -128,7 +132,7 @@ export class Surface {
         this.steps.set((cells as Uint16Array).subarray(row * width, (row + 1) * width), (y + row) * this.info.width + x);
       }
       this.upload(integers(cells as Uint16Array, width, height, 'R16UI'), this.range, x, y);
-      this.drawNormals({ x, y, width, height });
+      this.normals.change({ x, y, width, height });
     }
     this.tiles.update(this.steps, level);
   }
@@ -158,23 +162,6 @@ export class Surface {
   private upload(source: DataTexture, target: Texture, x: number, y: number): void {
     this.renderer.copyTextureToTexture(source, target, null, new Vector2(x, y));
     source.dispose();
-  }
-
-  private drawNormals({ x, y, width, height }: Omit<Changed, 'cells'>): void {
-    const all = { left: Math.max(0, x - NORMAL_REACH), right: Math.min(this.info.width, x + width + NORMAL_REACH) };
-    const top = Math.max(0, y - NORMAL_REACH);
-    const bottom = Math.min(this.info.height, y + height + NORMAL_REACH);
-    const strips = [[all.left, all.right]];
-    if (x < NORMAL_REACH) strips.push([Math.max(0, this.info.width + x - NORMAL_REACH), this.info.width]);
-    if (x + width + NORMAL_REACH > this.info.width) strips.push([0, Math.min(this.info.width, x + width + NORMAL_REACH - this.info.width)]);
-    const before = this.renderer.getRenderTarget();
-    this.normals.scissorTest = true;
-    for (const [left, right] of strips) {
-      this.normals.scissor.set(left!, top, right! - left!, bottom - top);
-      this.renderer.setRenderTarget(this.normals);
-      this.renderer.render(this.normalPass.scene, this.normalPass.camera);
-    }
-    this.renderer.setRenderTarget(before);
   }
 }
 
@@ -215,9 +202,9 @@ function shrink(cells: Uint8Array, x: number, y: number, width: number, height: 
   return { cells: small, x: left, y: top, width: right - left + 1, height: bottom - top + 1 };
 }
 
-function tileMesh(stride: number, tiles: number, shared: Uniforms): Mesh<InstancedBufferGeometry, ShaderMaterial> {
+function tileMesh(side: number, stride: number, tiles: number, shared: Uniforms): Mesh<InstancedBufferGeometry, ShaderMaterial> {
   const geometry = new InstancedBufferGeometry();
-  const { position, index } = tileGrid(TILE / stride);
+  const { position, index } = tileGrid(side / stride);
   geometry.setAttribute('position', position);
   geometry.setIndex(index);
   // Room for all tiles at once: three.js never takes notice of a larger buffer.
@@ -257,17 +244,7 @@ function fill(geometry: InstancedBufferGeometry, corners: number[], edges: numbe
   }
 }
 
-function quadPass(shared: Uniforms, level: DataTexture): { scene: Scene; camera: Camera } {
-  const geometry = new BufferGeometry();
-  geometry.setAttribute('position', new BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
-  const material = new ShaderMaterial({
-    vertexShader: QUAD_VERTEX, fragmentShader: NORMALS_FRAGMENT, glslVersion: GLSL3, blending: NoBlending, depthTest: false,
-    depthWrite: false, uniforms: { ...shared, uLevel: { value: level } },
-  });
-  const quad = new Mesh(geometry, material);
-  quad.frustumCulled = false;
-  const scene = new Scene();
-  scene.add(quad);
-  return { scene, camera: new Camera() };
+/** Samples from one that is held to the next, where they are densest. level: twice the logarithm of that. */
+function spacingOf(level: Uint8Array): number {
+  return 2 ** Math.floor(level.reduce((least, one) => Math.min(least, one), 255) / 2);
 }
-

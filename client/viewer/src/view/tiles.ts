@@ -1,16 +1,16 @@
-// Level of detail: the grid in tiles of 64 x 64 samples, each drawn with every 1st, 2nd, 4th ... sample.
+// Level of detail: the grid in square tiles, each drawn with every 1st, 2nd, 4th ... sample.
 
 import type { PerspectiveCamera } from 'three';
 import { Frustum, Matrix4, Sphere, Vector3 } from 'three';
 import type { ScanInfo } from '../protocol/messages.ts';
 import { pointAt } from './framing.ts';
 
-export const TILE = 64;
 export const STRIDES = [1, 2, 4, 8, 16, 32] as const;
 const BLOCK = 8;
 
-/** How fine to draw: side of a drawn cell on the screen, and most triangles of a frame. */
+/** How fine to draw: side of a tile [samples], side of a drawn cell on the screen, and most triangles of a frame. */
 export interface Detail {
+  tileSide: number;
   cellPx: number;
   trianglesMax: number;
 }
@@ -37,13 +37,14 @@ export class Tiles {
   private readonly stride: Int32Array;
   private readonly frustum = new Frustum();
 
-  constructor(private readonly info: ScanInfo) {
-    this.across = Math.ceil(info.width / TILE);
-    this.down = Math.ceil(info.height / TILE);
+  /** side: of a tile [samples]; a multiple of 64. */
+  constructor(private readonly info: ScanInfo, private readonly side: number) {
+    this.across = Math.ceil(info.width / this.side);
+    this.down = Math.ceil(info.height / this.side);
     this.stride = new Int32Array(this.across * this.down);
     for (let row = 0; row < this.down; row++) {
       for (let column = 0; column < this.across; column++) {
-        this.tiles.push({ column: column * TILE, row: row * TILE, centre: new Vector3(), reachMm: 0, finest: 1 });
+        this.tiles.push({ column: column * this.side, row: row * this.side, centre: new Vector3(), reachMm: 0, finest: 1 });
       }
     }
   }
@@ -56,7 +57,7 @@ export class Tiles {
   update(steps: Uint16Array, level: Uint8Array): void {
     const { width, height, stepMm, pitchMm, zMaxMm, theta0Rad } = this.info;
     for (const tile of this.tiles) {
-      const [columns, rows] = [Math.min(TILE, width - tile.column), Math.min(TILE, height - tile.row)];
+      const [columns, rows] = [Math.min(this.side, width - tile.column), Math.min(this.side, height - tile.row)];
       let [least, most] = [Infinity, 0];
       for (let y = 0; y < rows; y += 4) {
         for (let x = 0; x < columns; x += 4) {
@@ -93,7 +94,7 @@ export class Tiles {
       const wanted = Math.max(cellPx / samplePx, tile.finest);
       const stride = Math.min(2 ** Math.max(0, Math.floor(Math.log2(wanted))), STRIDES.at(-1)!);
       this.stride[index] = seen ? stride : 0;
-      triangles += seen ? 2 * (TILE / stride) ** 2 : 0;
+      triangles += seen ? 2 * (this.side / stride) ** 2 : 0;
     });
     return triangles;
   }

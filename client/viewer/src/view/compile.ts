@@ -1,0 +1,23 @@
+// Waiting for the graphics card without keeping the page's thread.
+
+import type { Camera, Object3D, WebGLRenderer } from 'three';
+
+const LOOK_MS = 4;
+
+/** Once the card has done all that it was told so far. */
+export async function cardIsDone(renderer: WebGLRenderer): Promise<void> {
+  const gl = renderer.getContext() as WebGL2RenderingContext;
+  const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+  gl.flush();
+  while (fence && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
+    await new Promise((look) => setTimeout(look, LOOK_MS));
+  }
+  gl.deleteSync(fence);
+}
+
+/** Compile what an object is drawn with, for the render target that is set. */
+export async function compile(renderer: WebGLRenderer, object: Object3D, camera: Camera): Promise<void> {
+  if (renderer.extensions.has('KHR_parallel_shader_compile')) await renderer.compileAsync(object, camera);
+  else renderer.compile(object, camera);
+  await cardIsDone(renderer);
+}

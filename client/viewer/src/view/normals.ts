@@ -1,0 +1,144 @@
+// Normals of the range as a texture, drawn by a pass over the rectangles that changed.
+
+import {
+  BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, GLSL3, LinearFilter, Mesh, NoBlending, RepeatWrapping, Scene,
+  ShaderMaterial, Vector2, WebGLRenderTarget,
+} from 'three';
+import type { DataTexture, IUniform, WebGLRenderer } from 'three';
+import type { Changed } from '../protocol/model.ts';
+import { compile } from './compile.ts';
+import { COPY_FRAGMENT, NORMALS_FRAGMENT, QUAD_VERTEX } from './shaders.ts';
+
+/** Differences of a normal reach this far beyond the samples that changed. */
+const REACH = 24;
+
+type Uniforms = Record<string, IUniform>;
+type Rectangle = Omit<Changed, 'cells'>;
+
+export class Normals {
+  private target: WebGLRenderTarget;
+  private due: 'all' | Rectangle[] = 'all';
+  private readonly pass: Pass;
+  private readonly copy: Pass;
+
+  /**
+   * uniforms: of the surface; `uNormals` among them is kept up to date. level: of range, by 8 x 8 blocks.
+   * spacing: between the samples held, at least: a texture as coarse as half of that shows as much, and is drawn sooner.
+   */
+  constructor(
+    private readonly renderer: WebGLRenderer, private readonly width: number, private readonly height: number,
+    private readonly uniforms: Uniforms, level: DataTexture, spacing: number,
+  ) {
+    const stride = Math.max(1, spacing / 2);
+    this.pass = new Pass(NORMALS_FRAGMENT, { ...uniforms, uLevel: { value: level }, uCell: { value: new Vector2(1, 1) } });
+    this.copy = new Pass(COPY_FRAGMENT, { uFrom: { value: null }, uSize: uniforms['uSize']! });
+    this.target = targetOf(Math.ceil(width / stride), Math.ceil(height / stride));
+    uniforms['uNormals']!.value = this.target.texture;
+  }
+
+  /** Have the programs compiled. */
+  async compile(): Promise<void> {
+    await Promise.all([this.pass, this.copy].map((pass) => pass.compile(this.renderer, this.target)));
+  }
+
+  /** Whether there is a normal for every sample. */
+  get isFull(): boolean {
+    return this.target.width === this.width;
+  }
+
+  /** Have one for every sample from here on. */
+  fill(): void {
+    if (this.isFull) return;
+    this.drawDue();
+    const coarse = this.target;
+    this.target = targetOf(this.width, this.height);
+    this.copy.uniforms['uFrom']!.value = coarse.texture;
+    this.render(this.copy, 0, 0, this.width, this.height);
+    coarse.dispose();
+    this.uniforms['uNormals']!.value = this.target.texture;
+  }
+
+  /** All samples have changed. */
+  changeAll(): void {
+    this.due = 'all';
+  }
+
+  /** These samples have changed. */
+  change(rectangle: Rectangle): void {
+    this.fill();
+    if (this.due !== 'all') this.due.push(rectangle);
+  }
+
+  /** Draw the normals of what has changed. */
+  drawDue(): void {
+    if (this.due === 'all') this.render(this.pass, 0, 0, this.target.width, this.target.height);
+    else for (const rectangle of this.due) this.draw(rectangle);
+    this.due = [];
+  }
+
+  private draw({ x, y, width, height }: Rectangle): void {
+    const [left, right] = [Math.max(0, x - REACH), Math.min(this.width, x + width + REACH)];
+    const [top, bottom] = [Math.max(0, y - REACH), Math.min(this.height, y + height + REACH)];
+    this.render(this.pass, left, top, right, bottom);
+    if (left === 0) this.render(this.pass, Math.max(right, this.width + x - REACH), top, this.width, bottom);
+    if (right === this.width) this.render(this.pass, 0, top, Math.min(left, x + width + REACH - this.width), bottom);
+  }
+
+  dispose(): void {
+    this.target.dispose();
+    this.pass.dispose();
+    this.copy.dispose();
+  }
+
+  private render(pass: Pass, left: number, top: number, right: number, bottom: number): void {
+    if (right <= left) return;
+    const before = this.renderer.getRenderTarget();
+    (pass.uniforms['uCell']?.value as Vector2 | undefined)?.set(this.width / this.target.width, this.height / this.target.height);
+    this.target.scissorTest = true;
+    this.target.scissor.set(left, top, right - left, bottom - top);
+    this.renderer.setRenderTarget(this.target);
+    pass.render(this.renderer);
+    this.renderer.setRenderTarget(before);
+  }
+}
+
+function targetOf(width: number, height: number): WebGLRenderTarget {
+  return new WebGLRenderTarget(width, height, {
+    depthBuffer: false, wrapS: RepeatWrapping, wrapT: ClampToEdgeWrapping, minFilter: LinearFilter, magFilter: LinearFilter,
+    generateMipmaps: false,
+  });
+}
+
+/** A fragment shader over all of a target. */
+class Pass {
+  private readonly scene = new Scene();
+  private readonly camera = new Camera();
+  private readonly quad: Mesh<BufferGeometry, ShaderMaterial>;
+
+  constructor(fragmentShader: string, readonly uniforms: Uniforms) {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute('position', new BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
+    const material = new ShaderMaterial({
+      vertexShader: QUAD_VERTEX, fragmentShader, glslVersion: GLSL3, blending: NoBlending, depthTest: false, depthWrite: false, uniforms,
+    });
+    this.quad = new Mesh(geometry, material);
+    this.quad.frustumCulled = false;
+    this.scene.add(this.quad);
+  }
+
+  async compile(renderer: WebGLRenderer, target: WebGLRenderTarget): Promise<void> {
+    renderer.setRenderTarget(target); // the program depends on it
+    const compiled = compile(renderer, this.scene, this.camera);
+    renderer.setRenderTarget(null);
+    await compiled;
+  }
+
+  render(renderer: WebGLRenderer): void {
+    renderer.render(this.scene, this.camera);
+  }
+
+  dispose(): void {
+    this.quad.geometry.dispose();
+    this.quad.material.dispose();
+  }
+}
