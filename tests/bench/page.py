@@ -76,7 +76,11 @@ def _beside(figure: dict[str, Any]) -> str:
 async def _empty_page() -> AsyncIterator[str]:
     """Address of the page that draws nothing."""
     application = web.Application()
-    application.router.add_get("/", lambda _: web.FileResponse(EMPTY))  # type: ignore[arg-type, return-value]
+
+    async def respond(_: web.Request) -> web.FileResponse:
+        return web.FileResponse(EMPTY)
+
+    application.router.add_get("/", respond)
     runner = web.AppRunner(application)
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)
