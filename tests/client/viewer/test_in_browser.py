@@ -156,7 +156,7 @@ def test_pins_stay_with_the_scan(browser: Browser, node: RunningNode) -> None:
 
 def test_a_scan_is_renamed_and_deleted_after_being_asked(browser: Browser, tmp_path: Path) -> None:
     with ExitStack() as stack, ThreadPoolExecutor(1) as aside:
-        line = aside.submit(run_line, stack, tmp_path, "--specimen", "sphere", *FAST).result()
+        line = aside.submit(run_line, stack, tmp_path, "--specimen", "cylinder", *FAST).result()
         with opened(browser, line.url) as page:
             page.locator("summary:has-text('This scan')").click()
             page.get_by_label("Name").fill("back, left")
