@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from node.access_command import add_access_commands
+from node.install_command import add_install_command
 from node.library_command import add_library_command
 
 ADDRESS = "the scanner's: path of a serial port, serial:VID:PID[:SERIAL] or usb:VID:PID[:SERIAL]"
@@ -15,6 +16,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     """Offer `serve` and `doctor`."""
     add_library_command(subparsers)
     add_access_commands(subparsers)
+    add_install_command(subparsers)
     serve = subparsers.add_parser("serve", help="run the node: read the scanner, keep scans, serve clients")
     serve.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML); options here win over them")
     serve.add_argument("--library", metavar="DIR", help="folder the scans are kept in")

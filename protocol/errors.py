@@ -11,6 +11,7 @@ FoveascanError
 │   └── ScannerFault     the scanner answered, and said no
 ├── LibraryError         a scan on disk that cannot be read, written or found
 ├── AccessError          who may come in: a certificate, token or code that cannot be read, written or found
+├── InstallError         the service cannot be installed, updated or removed
 └── ConfigError          a setting with a wrong type, an unknown key or a value out of bounds (also a ValueError)
 """
 
@@ -57,6 +58,10 @@ class LibraryError(FoveascanError):
 
 class AccessError(FoveascanError):
     """A certificate, a token or a pairing code that cannot be read, written or found."""
+
+
+class InstallError(FoveascanError):
+    """The service cannot be installed, updated or removed."""
 
 
 class ConfigError(FoveascanError, ValueError):

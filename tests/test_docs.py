@@ -137,7 +137,7 @@ def test_commands_of_the_readme_parse(line: str) -> None:
 
 
 def test_the_table_of_commands_is_complete() -> None:
-    listed = set(re.findall(r"^\| `foveascan (\w+)` \|", README, re.MULTILINE))
+    listed = set(re.findall(r"^\| `foveascan ([\w-]+)` \|", README, re.MULTILINE))
     choices = build_parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
     assert listed == set(choices or ())
 

@@ -1,0 +1,166 @@
+"""The service from its installation to its removal, under a real systemd with every restriction of its unit."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.systemd.booted import Machine, booted, why_not
+
+WHY_NOT = why_not()
+pytestmark = [pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT), pytest.mark.timeout(300)]
+STOP_S = 5.0
+SETTINGS = "/etc/foveascan/node.toml"
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Machine]:
+    """One with the service installed; tests follow each other on it."""
+    with booted(tmp_path_factory.mktemp("booted")) as machine:
+        machine.write(SETTINGS, settings(port))
+        said = machine.foveascan("install-service")
+        assert f"kept     {SETTINGS}: as somebody changed it" in said
+        yield machine
+
+
+def settings(port: int, more: str = "") -> str:
+    library = "[library]\nfolder = \"/var/lib/foveascan\"\n[discovery]\nenabled = false\n"
+    return f"{library}[server]\nlisten = \"127.0.0.1:{port}\"\n{more}"
+
+
+def health(machine: Machine, port: int) -> dict[str, object]:
+    """What the node says of itself, asked within its machine without a login."""
+    code = f"""
+import http.client, ssl
+line = http.client.HTTPSConnection("127.0.0.1", {port}, timeout=5, context=ssl._create_unverified_context())
+line.request("GET", "/healthz"); print(line.getresponse().read().decode())
+"""
+    return dict(json.loads(machine.run("/opt/foveascan/bin/python", "-I", "-c", code).stdout))
+
+
+def main_pid(machine: Machine) -> str:
+    return machine.show("MainPID")
+
+
+def test_it_runs_as_its_account_behind_every_restriction(machine: Machine, port: int) -> None:
+    assert machine.show("ActiveState") == "active"
+    assert machine.show("StatusText") == f"Serving https://127.0.0.1:{port}, without a scanner"
+    assert health(machine, port) == {"status": "ready"}
+    status = machine.run("cat", f"/proc/{main_pid(machine)}/status").stdout
+    assert re.search(r"^NoNewPrivs:\t1$.*^Seccomp:\t2$", status, re.MULTILINE | re.DOTALL)
+    assert re.search(r"^CapBnd:\t0+$", status, re.MULTILINE)
+    account = machine.run("id", "-u", "foveascan").stdout.strip()
+    assert account != "0" and re.search(rf"^Uid:\t{account}\t", status, re.MULTILINE)
+    mounts = machine.run("cat", f"/proc/{main_pid(machine)}/mountinfo").stdout
+    [top] = [line.split() for line in mounts.splitlines() if line.split()[4] == "/"][-1:]
+    assert "ro" in top[5].split(",")
+    assert machine.run("stat", "-c", "%U %a", "/var/lib/foveascan").stdout.strip() == "foveascan 750"
+
+
+def test_pairing_and_the_doctor_find_it(machine: Machine, port: int) -> None:
+    said = json.loads(machine.foveascan("pair", "--config", SETTINGS, "--name", "me", "--role", "admin", "--json"))
+    machine.foveascan("join", said["code"], "--node", f"https://127.0.0.1:{port}")
+    assert machine.foveascan("scans", "--node", f"https://127.0.0.1:{port}", "--json") == ""
+    doctor = machine.foveascan("doctor", "--config", SETTINGS, check=False)
+    assert f"a node answers at 127.0.0.1:{port}" in doctor
+
+
+def test_a_reload_takes_sound_settings_and_refuses_others(machine: Machine, port: int) -> None:
+    before = main_pid(machine)
+    machine.write(SETTINGS, settings(port, "max_clients = 0\n"))
+    assert machine.run("systemctl", "reload", "foveascan", check=False).returncode
+    assert "server.max_clients" in machine.log() and "read the settings anew" not in machine.log()
+    machine.write(SETTINGS, settings(port, "max_clients = 7\n"))
+    machine.run("systemctl", "reload", "foveascan")
+    until = time.monotonic() + 10
+    while "read the settings anew: server.max_clients changed" not in machine.log():
+        assert time.monotonic() < until, machine.log()
+        time.sleep(0.1)
+    machine.await_property("ActiveState", "active")
+    assert main_pid(machine) == before
+
+
+def test_a_node_that_dies_or_hangs_is_started_anew(machine: Machine, port: int) -> None:
+    for signal, more in (("KILL", ""), ("STOP", "[Service]\nWatchdogSec=3\n")):
+        machine.write("/etc/systemd/system/foveascan.service.d/watchdog.conf", more)
+        machine.run("systemctl", "daemon-reload")
+        machine.run("systemctl", "restart", "foveascan")
+        machine.run("systemctl", "kill", "-s", signal, "foveascan")
+        machine.await_property("NRestarts", "1")
+        machine.await_property("ActiveState", "active")
+        assert health(machine, port) == {"status": "ready"}
+    machine.run("rm", "/etc/systemd/system/foveascan.service.d/watchdog.conf")
+    machine.run("systemctl", "daemon-reload")
+
+
+def test_a_key_is_handed_over_as_a_credential(machine: Machine, port: int) -> None:
+    own = machine.run("cat", "/var/lib/foveascan/access/certificate.pem").stdout
+    key, certificate = re.findall(r"-----BEGIN.*?-----END[^\n]*\n", own, re.DOTALL)
+    machine.write("/etc/foveascan/certificate.pem", certificate)
+    machine.write("/etc/credstore/foveascan.key", key)
+    machine.run("chmod", "600", "/etc/credstore/foveascan.key")
+    named = "certificate = \"/etc/foveascan/certificate.pem\"\nkey = \"credential:foveascan.key\"\n"
+    machine.write(SETTINGS, settings(port, named))
+    machine.run("systemctl", "restart", "foveascan")
+    assert health(machine, port) == {"status": "ready"}
+    machine.write(SETTINGS, settings(port))
+    machine.run("systemctl", "restart", "foveascan")
+
+
+def test_the_same_again_changes_nothing_and_settings_that_do_not_fit_stop_it(machine: Machine, port: int) -> None:
+    machine.write(SETTINGS, settings(port, "max_clients = 0\n"))
+    before = main_pid(machine)
+    said = machine.foveascan("install-service", check=False)
+    assert "nothing was changed: this version does not accept the settings: server.max_clients" in said
+    assert main_pid(machine) == before
+    machine.write(SETTINGS, settings(port))
+    said = machine.foveascan("install-service")
+    assert not re.search("^(make|renew|switch)", said, re.MULTILINE), said
+
+
+def test_an_update_runs_and_one_that_does_not_come_up_leaves_what_was_running(machine: Machine, port: int) -> None:
+    first = machine.run("readlink", "/opt/foveascan/bin").stdout
+    machine.run("sh", "-c", "cp -r /opt/src/. /opt/newer && rm -rf /opt/newer/.git")
+    machine.run("sh", "-c", "echo '# newer' >> /opt/newer/node/notify.py")
+    machine.foveascan("install-service", sources="/opt/newer")
+    second = machine.run("readlink", "/opt/foveascan/bin").stdout
+    assert second != first
+    assert health(machine, port) == {"status": "ready"}
+    bug = "'s/^async def start_node.*/&\\n    raise SystemExit(3)/'"
+    machine.run("sh", "-c", f"sed -i {bug} /opt/newer/node/daemon.py")
+    said = machine.foveascan("install-service", sources="/opt/newer", check=False)
+    assert "failed: what was before comes back" in said and "systemctl restart foveascan failed" in said
+    assert machine.run("readlink", "/opt/foveascan/bin").stdout == second
+    machine.await_property("ActiveState", "active")
+    assert health(machine, port) == {"status": "ready"}
+
+
+def test_it_stops_in_time_and_goes_without_a_trace_but_what_is_kept(machine: Machine) -> None:
+    began_s = time.monotonic()
+    machine.run("systemctl", "stop", "foveascan")
+    assert time.monotonic() - began_s < STOP_S
+    assert machine.show("Result") == "success"
+    said = machine.foveascan("install-service", "--remove")
+    assert "kept: settings in /etc/foveascan" in said
+    left = machine.run("sh", "-c", "find / -xdev -path '*foveascan*' -not -path '/opt/s*' -not -path '/proc/*' -prune")
+    kept = {Path(line) for line in left.stdout.split() if line.startswith(("/etc", "/var/lib", "/opt/foveascan"))}
+    assert kept == {
+        Path("/etc/foveascan"), Path("/var/lib/foveascan"), Path("/etc/credstore/foveascan.key"),
+        Path("/etc/systemd/system/foveascan.service.d"),
+    }  # fmt: skip
+    machine.foveascan("install-service", "--remove", "--purge")
+    for gone in ("/etc/foveascan", "/var/lib/foveascan", "/etc/credstore/foveascan.key"):
+        assert machine.run("test", "-e", gone, check=False).returncode == 1
+    assert machine.run("id", "foveascan", check=False).returncode
