@@ -41,7 +41,8 @@ class ScannerConfig:
 @dataclass(frozen=True, slots=True)
 class SweepReport:
     """What a sweep took: column pieces expected, received, received twice, belonging nowhere; columns asked for again;
-    bytes that could not be read; its time; and the digest of what was received, as in SWEEP_END."""
+    bytes that could not be read; its time; the digest of what was received, as in SWEEP_END; and in how many stretches
+    those bytes came."""
 
     expected: int = 0
     received: int = 0
@@ -51,6 +52,7 @@ class SweepReport:
     dropped_bytes: int = 0
     elapsed_s: float = 0.0
     digest: int = 0
+    dropped_frames: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,8 @@ class Collector:
         """Anything but a column."""
         match event:
             case Dropped(count=count):
-                self._tally = replace(self._tally, dropped_bytes=self._tally.dropped_bytes + count)
+                bytes_, frames = self._tally.dropped_bytes + count, self._tally.dropped_frames + 1
+                self._tally = replace(self._tally, dropped_bytes=bytes_, dropped_frames=frames)
             case Unanswered(RequestColumns()):
                 yield self._break("no answer to a request for missing columns")
             case Refused(RequestColumns(), _, text):

@@ -72,6 +72,30 @@ class CaptureStatus:
                 return "a sweep is running already"
 
 
+@dataclass(slots=True)
+class SweepCounts:
+    """What all sweeps took since the start: pieces of columns, columns asked for again, what could not be read."""
+
+    range_columns: int = 0
+    texture_columns: int = 0
+    requested_columns: int = 0
+    dropped_frames: int = 0
+    dropped_bytes: int = 0
+    interrupted: int = 0
+
+    def take(self, event: SweepEvent) -> None:
+        """Count what happens in a sweep."""
+        match event:
+            case RangeColumn():
+                self.range_columns += 1
+            case TextureColumn():
+                self.texture_columns += 1
+            case SweepFinished(report) | SweepInterrupted(report=report):
+                self.requested_columns += report.requested_columns
+                self.dropped_frames += report.dropped_frames
+                self.dropped_bytes += report.dropped_bytes
+
+
 @dataclass(frozen=True, slots=True)
 class _Resume:
     """The order to go on with an interrupted sweep. by_itself : nobody asked, so the table must not turn anew."""
@@ -109,6 +133,7 @@ class Capture:
         self._sweep_request = request
         self._repairs = repairs
         self._beat_s = time.monotonic()
+        self.counts = SweepCounts()  # of the capture thread; others only look
         self._stop = threading.Event()
         self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
         self._order: SweepRequest | _Resume | None = None
@@ -273,6 +298,7 @@ class Capture:
         except FoveascanError as error:
             self._watch(SweepInterrupted(str(error), None, SweepReport()))
             running.leave(str(error))
+            self.counts.interrupted += 1
             if isinstance(error, DriverError):
                 raise
             self._end(str(error))
@@ -282,6 +308,7 @@ class Capture:
         with closing(events):
             for event in events:
                 self._beat()
+                self.counts.take(event)
                 match event:
                     case SweepStarted(header):
                         running.begin(header)
@@ -300,6 +327,7 @@ class Capture:
                         raise cause
                     case SweepInterrupted(reason):
                         running.leave(reason)
+                        self.counts.interrupted += 1
                         self._end(f"sweep interrupted: {reason}")
                 self._watch(event)
 

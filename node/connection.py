@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 
 from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
@@ -25,6 +26,7 @@ from node.classic_planner import ClassicUpdate
 from node.exhibits import Exhibits
 from node.foveate import Update
 from node.live import Live, Place
+from node.metrics import Metrics
 from node.rate import RateControl
 from protocol import messages as m
 from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
@@ -46,6 +48,19 @@ class _TooMany(RemoteWireError):
     """A client says more than messages_s allow."""
 
 
+@dataclass(frozen=True, slots=True)
+class House:
+    """What a stream works with. cold_start_bytes_s, messages_s : as configured."""
+
+    exhibits: Exhibits
+    live: Live
+    info: m.ServerInfo
+    audit: Audit
+    metrics: Metrics
+    cold_start_bytes_s: float
+    messages_s: float
+
+
 class Connection:
     """One stream from its greeting to its end."""
 
@@ -53,26 +68,22 @@ class Connection:
         self,
         socket: web.WebSocketResponse,
         login: Login,
-        audit: Audit,
         address: str,
-        exhibits: Exhibits,
-        live: Live,
-        info: m.ServerInfo,
-        cold_start_bytes_s: float,
-        messages_s: float,
+        house: House,
     ) -> None:
         self._socket = socket
         self.login = login
-        self._audit = audit
+        self._audit = house.audit
+        self._metrics = house.metrics
         self._who = Who(login.name, login.role or "", address)
-        self._exhibits = exhibits
-        self._live = live
+        self._exhibits = house.exhibits
+        self._live = house.live
         self._place: Place | None = None
         self._live_news = asyncio.Event()
-        self._info = info
+        self._info = house.info
         self._session = Session(Role.NODE)
-        self._rate = RateControl(cold_start_bytes_s)
-        self._messages = Bucket(messages_s, time.monotonic())
+        self._rate = RateControl(house.cold_start_bytes_s)
+        self._messages = Bucket(house.messages_s, time.monotonic())
         self._codecs: tuple[m.CodecName, ...] = ("htj2k",)
         self._geometries: tuple[Geometry, ...] = ()
         self._bound: Bound | None = None
@@ -214,6 +225,7 @@ class Connection:
             return  # of an update that a newer opening has overtaken
         if not self._acknowledged.is_set():
             self._rate.acknowledged(self._sent_bytes, time.monotonic() - self._sent_s, ack.apply_ms / 1000)
+            self._metrics.measured(self._rate.bandwidth_bytes_s)
         if ack.digest != bound.state.holdings.digest():
             await self._send(m.Resync(bound.epoch, "digests differ"))
             return
@@ -264,6 +276,7 @@ class Connection:
             return
         self._bound = bound
         self._audit.note("opened", self._who, scan=scan.id)
+        self._metrics.opened()
         self._acknowledged.clear()
         await self._send(m.Opened(wanted.request, bound.epoch, view.info))
         if wanted.holdings is not None:
@@ -306,7 +319,8 @@ class Connection:
 
         model = self._exhibits.texture_model(bound.scan)
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
-        return await self._exhibits.work(partial(bound.plan, look, self._codecs, budget, superseded, model, quick))
+        job = partial(bound.plan, look, self._codecs, budget, superseded, model, quick)
+        return await self._exhibits.work(job, "look")
 
     async def _send_update(self, bound: Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float) -> None:
         if update.coded:
@@ -316,6 +330,7 @@ class Connection:
             await self._send_bytes(refinement)
         if isinstance(update, Update) and update.settle is not None:
             update = await self._exhibits.work(update.settled)
+        self._metrics.updated(update.reason)
         await self._send(updated(look, bound.next_seq, update, spent_s))
 
     async def _show_live(self) -> None:
@@ -343,9 +358,11 @@ class Connection:
 
     async def _send_bytes(self, data: bytes) -> None:
         self._sent_bytes += len(data)
+        self._metrics.sent(len(data))
         await self._socket.send_bytes(data)
 
     def _superseded(self, look: m.Look) -> m.Updated:
+        self._metrics.updated("superseded")
         next_seq = self._bound.next_seq if self._bound else 0
         return m.Updated(look.request, next_seq, "superseded")
 

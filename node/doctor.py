@@ -46,7 +46,7 @@ from node.machine import (
     written_last_s,
 )
 from node.scan_folder import name_problems
-from node.tls import certificate_file, read_certificate
+from node.tls import CREDENTIAL, certificate_file, key_file, read_certificate
 from protocol.errors import AccessError, ConfigError, LibraryError, PortLost
 from protocol.printable import counted
 
@@ -88,7 +88,7 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     yield check_port(port, is_used=who == "node")
     yield check_permission(port, account)
     yield check_server(config.server, who)
-    yield check_certificate(config.server, library, dt.datetime.now(dt.UTC))
+    yield check_certificate(config.server, library, dt.datetime.now(dt.UTC), account)
     yield check_disk(library, account)
     yield check_memory(available_bytes())
     yield check_clock(time.time(), written_last_s(Path(__file__), library), is_clock_synchronised())
@@ -198,8 +198,8 @@ def check_server(server: settings.Server, who: str) -> Finding:
         return Finding("server", "problem", f"{server.listen}: {error.strerror}", "correct server.listen")
 
 
-def check_certificate(server: settings.Server, library: Path, now: dt.datetime) -> Finding:
-    """Whether clients will find a certificate that is valid."""
+def check_certificate(server: settings.Server, library: Path, now: dt.datetime, account: Account) -> Finding:
+    """Whether clients will find a certificate that is valid, and its key is kept by those who should."""
     if server.insecure:
         return Finding("certificate", "warning", "none: no encryption, no logins", "remove server.insecure")
     path = certificate_file(server, library / FOLDER)
@@ -216,7 +216,30 @@ def check_certificate(server: settings.Server, library: Path, now: dt.datetime) 
         return Finding("certificate", "problem", f"{found}: not valid now", cure)
     if left < ENDS_SOON:
         return Finding("certificate", "warning", f"{found}: {left.days} days are left", cure)
-    return Finding("certificate", "ok", found)
+    return _check_key(server, library, path, account) or Finding("certificate", "ok", found)
+
+
+def _check_key(server: settings.Server, library: Path, certificate: Path, account: Account) -> Finding | None:
+    """What is wrong with the key of a certificate. A credential of systemd's is looked at by the service alone."""
+    if server.key is not None and server.key.startswith(CREDENTIAL):
+        return None
+    key = key_file(server, library / FOLDER)
+    try:
+        info = key.stat()
+        if info.st_mode & 0o007:
+            return Finding("certificate", "problem", f"everybody may read the key {key}", f"chmod 640 {key}")
+        if not account.may(info, READ):
+            found = f"{account.name} may not read the key {key}"
+            return Finding("certificate", "problem", found, f"chgrp {ACCOUNT} {key} && chmod 640 {key}")
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except PermissionError:
+        return None  # we may not look, and the account may
+    except ssl.SSLError as error:
+        cure = "correct server.certificate and server.key: the one belongs to another of the other"
+        return Finding("certificate", "problem", f"{certificate} and {key} do not go together: {error.reason}", cure)
+    except OSError as error:
+        return Finding("certificate", "problem", f"{key}: {error.strerror}", "correct server.key")
+    return None
 
 
 def check_disk(folder: Path, account: Account) -> Finding:

@@ -8,7 +8,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar, overload
+from typing import Literal, TypeVar, overload
 
 from node.classic import ClassicView, build_classic_view
 from node.first_view import FirstView, build_first_view, texture_as_seen
@@ -20,6 +20,7 @@ from protocol.messages import CodecName, Profile
 VIEWS_MAX = 8
 MODELS_MAX = 8
 T = TypeVar("T")
+Work = Literal["look", "fovea", "view", "other"]
 Key = tuple[str, CodecName, Profile]
 Opening = tuple[Scan, FirstView | ClassicView]
 
@@ -31,6 +32,8 @@ class Exhibits:
         self.library = library
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="encode")
+        self._workers = workers
+        self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0
         self._moved_s = 0.0
         self._views: OrderedDict[Key, asyncio.Future[Opening]] = OrderedDict()
@@ -49,7 +52,7 @@ class Exhibits:
         key: Key = self.library.resolve(scan_id), codec, profile
         future = self._views.get(key)
         if future is None:
-            future = asyncio.ensure_future(self.work(lambda: self._build(*key)))
+            future = asyncio.ensure_future(self.work(lambda: self._build(*key), "view"))
             self._views[key] = future
             while len(self._views) > VIEWS_MAX:
                 self._views.popitem(last=False)
@@ -79,16 +82,33 @@ class Exhibits:
             del self._views[key]
         self._models.pop(scan_id, None)
 
-    async def work(self, job: Callable[[], T]) -> T:
+    def tell(self, encoded: Callable[[Work, float, float], object]) -> None:
+        """Have somebody told of every job: what it was for, how long it waited and took [s], in the event loop."""
+        self._encoded = encoded
+
+    async def work(self, job: Callable[[], T], of: Work = "other") -> T:
         """Run a job in one of the encoding threads."""
+        asked_s = begun_s = time.monotonic()
+
+        def timed() -> T:
+            nonlocal begun_s
+            begun_s = time.monotonic()
+            return job()
+
         if not self._working:
-            self._moved_s = time.monotonic()
+            self._moved_s = asked_s
         self._working += 1
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._pool, job)
+            return await asyncio.get_running_loop().run_in_executor(self._pool, timed)
         finally:
             self._working -= 1
             self._moved_s = time.monotonic()
+            self._encoded(of, begun_s - asked_s, self._moved_s - begun_s)
+
+    @property
+    def queued(self) -> int:
+        """How many jobs wait for a thread."""
+        return max(0, self._working - self._workers)
 
     @property
     def beat_s(self) -> float:

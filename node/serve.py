@@ -16,19 +16,20 @@ from aiohttp.typedefs import Handler
 from node.access import Access
 from node.audit import NODE, Audit, Who
 from node.audit_routes import SCAN, AuditRoutes
-from node.auth import CHALLENGE, LOGIN, Auth, Refusal, require
+from node.auth import CHALLENGE, LOGIN, Auth, Refusal, place_of, require
 from node.capture import Capture, CaptureStatus
 from node.config import Config
-from node.connection import Connection
+from node.connection import Connection, House
 from node.derive import Derivation
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
 from node.gate import Gate
-from node.health import Health, examine_health
+from node.health_routes import HealthRoutes
 from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
 from node.live import Live
+from node.metrics import Metrics
 from node.page import Page
 from node.pairing import PairingRoutes
 from node.proxy import believe
@@ -90,16 +91,21 @@ class NodeServer:
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._hanging_up: set[asyncio.Task[None]] = set()
         self._gate = Gate(config.limits, is_open=c.insecure, proxies=c.trusted_proxies)
-        middlewares = [believe(c.trusted_proxies), _explain, self._gate.admit, self._auth.admit]
+        self._metrics = Metrics()
+        exhibits.tell(self._metrics.encoded)
+        middlewares = [self._count, believe(c.trusted_proxies), _explain, self._gate.admit, self._auth.admit]
         self._app = web.Application(middlewares=middlewares, client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.extend((_harden, audit_routes.witness))
         self._app.on_cleanup.append(self._close_audit)
         pairing = PairingRoutes(access, tls, self.audit, self._refused, info.id, info.name, self._expel)
+        health = HealthRoutes(
+            self._metrics, exhibits, capture, tls, self.audit, self._gate,
+            lambda: len(self._connections), lambda: self._is_stopping,
+        )  # fmt: skip
         self.derivation = Derivation(exhibits, self.publish, self.audit)
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
         self._app.add_routes([
             *Page().routes(),
-            web.get("/healthz", self._health),
             web.get("/v1/node", self._node),
             web.get("/v1/scans", self._scans),
             web.get("/v1/scans/{scan}", self._scan),
@@ -111,6 +117,7 @@ class NodeServer:
             *self.derivation.routes(),
             *pairing.routes(),
             *audit_routes.routes(),
+            *health.routes(),
         ])  # fmt: skip
         self._runner = web.AppRunner(self._app, access_log=None, handle_signals=False, shutdown_timeout=REQUESTS_S)
 
@@ -171,6 +178,21 @@ class NodeServer:
     def _refused(self, who: Who, why: Refusal, what: str) -> None:
         """Somebody was turned away."""
         self.audit.refuse(who, f"{why}: {what}" if what else why)
+        self._metrics.refused(why)
+
+    @web.middleware
+    async def _count(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Count every request and its answer."""
+        status, size_bytes = 500, 0
+        try:
+            response = await handler(request)
+            status, size_bytes = response.status, response.content_length or 0
+            return response
+        except web.HTTPException as redirect:
+            status = redirect.status
+            raise
+        finally:
+            self._metrics.answered(request.method, place_of(request), status, size_bytes)
 
     async def _close_audit(self, app: web.Application) -> None:
         await asyncio.to_thread(self.audit.close)
@@ -204,17 +226,6 @@ class NodeServer:
             connection.show_live()
 
     # -- what may be asked -----------------------------------------------------------------------------------------
-
-    async def _health(self, request: web.Request) -> web.Response:
-        capture = self._capture_status()
-        if self._is_stopping or capture.phase == "stopped":
-            health = Health("stopping")
-        else:
-            health = await asyncio.to_thread(examine_health, capture, self._exhibits.library)
-        status = 503 if health.status == "stopping" else 200
-        if request[LOGIN].role is None:
-            return _json({"status": health.status}, status)
-        return _json({**asdict(health), "capture": asdict(capture)}, status)
 
     async def _node(self, request: web.Request) -> web.Response:
         problems = [asdict(problem) for problem in self._exhibits.library.problems]
@@ -268,10 +279,12 @@ class NodeServer:
         if line is None:  # gone again already
             return stream
         _bound_buffers(line)
-        connection = Connection(
-            stream, request[LOGIN], self.audit, request.remote or "", self._exhibits, self._live, self._info,
-            self._config.planner.cold_start_bytes_s, self._config.limits.messages_s,
+        c = self._config
+        house = House(
+            self._exhibits, self._live, self._info, self.audit, self._metrics,
+            c.planner.cold_start_bytes_s, c.limits.messages_s,
         )  # fmt: skip
+        connection = Connection(stream, request[LOGIN], request.remote or "", house)
         self._connections[connection] = line
         try:
             await connection.run()

@@ -144,7 +144,7 @@ class SharedFoveae:
     async def _make_plan(self, scan: Scan, view: FirstView, look: m.Look, codec: m.CodecName) -> str:
         model = self._exhibits.texture_model(scan)
         job = partial(plan_update, scan, view.state, look, codec, look.max_bytes, lambda: False, model)
-        update = await self._exhibits.work(job)
+        update = await self._exhibits.work(job, "fovea")
         place = canonical_path(scan.id, self._epoch, update.coded)
         self.encodes += 1
         await self._bodies.get(place, partial(_ready, body_of(update.coded)))
@@ -164,7 +164,7 @@ class SharedFoveae:
     async def _encode(self, job: Callable[[], bytes]) -> bytes:
         self.encodes += 1
         try:
-            return await self._exhibits.work(job)
+            return await self._exhibits.work(job, "fovea")
         except (LatticeError, CodecError, ValueError) as error:
             raise web.HTTPBadRequest(text=f"no such fovea: {error}") from None
 

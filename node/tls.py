@@ -36,6 +36,8 @@ CREDENTIAL = "credential:"
 class Tls:
     """What the server shows to clients. context : for its sockets; fingerprint : SHA-256 of the certificate, hex.
 
+    ends_unix_s : when that ends.
+
     folder : of `node.access`; node_id : names the certificate. Raises AccessError.
     """
 
@@ -47,6 +49,7 @@ class Tls:
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
         self.context.set_alpn_protocols(["http/1.1"])
         self.fingerprint = ""
+        self.ends_unix_s = 0.0
         self.refresh()
 
     def refresh(self) -> bool:
@@ -55,6 +58,7 @@ class Tls:
             renew_own(self._folder, self._node_id, self._server.host, dt.datetime.now(dt.UTC))
         certificate, key = certificate_file(self._server, self._folder), key_file(self._server, self._folder)
         shown = certificate_fingerprint(certificate)
+        self.ends_unix_s = read_certificate(certificate).not_valid_after_utc.timestamp()
         if shown == self.fingerprint:
             return False
         try:

@@ -304,12 +304,29 @@ def test_the_command_prints_a_line_a_check_and_fails_where_there_is_a_problem(
 def test_a_certificate_is_judged_by_the_days_it_has_left(tmp_path: Path) -> None:
     now = dt.datetime(2026, 11, 22, tzinfo=dt.UTC)
     secure = settings.Server()
-    found = [doctor.check_certificate(settings.Server(insecure=True), tmp_path, now)]
-    found.append(doctor.check_certificate(secure, tmp_path, now))
+    found = [doctor.check_certificate(settings.Server(insecure=True), tmp_path, now, ROOT)]
+    found.append(doctor.check_certificate(secure, tmp_path, now, ROOT))
     renew_own(access_folder(tmp_path), "1234", "127.0.0.1", now)
     for days in (0, 790, 800, -400):
-        found.append(doctor.check_certificate(secure, tmp_path, now + dt.timedelta(days=days)))
+        found.append(doctor.check_certificate(secure, tmp_path, now + dt.timedelta(days=days), ROOT))
     assert states(*found) == ["warning", "ok", "ok", "warning", "problem", "problem"]
-    assert states(doctor.check_certificate(settings.Server(certificate="/nowhere", key="/nowhere"), tmp_path, now)) == [
-        "problem"
-    ]
+    elsewhere = settings.Server(certificate="/nowhere", key="/nowhere")
+    assert states(doctor.check_certificate(elsewhere, tmp_path, now, ROOT)) == ["problem"]
+
+
+def test_a_key_that_others_may_read_or_that_belongs_to_another_certificate_is_a_problem(tmp_path: Path) -> None:
+    now = dt.datetime(2026, 11, 22, tzinfo=dt.UTC)
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir(mode=0o700)
+        renew_own(tmp_path / name, name, "127.0.0.1", now)
+    one, other = (str(tmp_path / name / "certificate.pem") for name in ("one", "other"))
+
+    def found(key: str, account: Account = ROOT) -> Finding:
+        return doctor.check_certificate(settings.Server(certificate=one, key=key), tmp_path, now, account)
+
+    assert found(one).state == "ok"
+    assert "do not go together" in found(other).found
+    assert found(one, STRANGER).cure.startswith("chgrp foveascan ")
+    assert found(str(tmp_path / "none")).found.endswith("none: No such file or directory")
+    os.chmod(one, 0o644)
+    assert (found(one).found, found(one).cure) == (f"everybody may read the key {one}", f"chmod 640 {one}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +11,7 @@ from typing import Any
 import pytest
 
 from node import health
-from node.capture import CaptureStatus
+from node.capture import CaptureStatus, SweepCounts
 from node.durable import EASY_BYTES
 from node.library import About, Library
 from node.scan_quality import ScanQuality
@@ -22,6 +24,12 @@ class Turntable:
 
     def __init__(self) -> None:
         self.status = CaptureStatus("ready", sweeps=2)
+        self.counts = SweepCounts(range_columns=7)
+        self.silent_s = 0.0
+
+    @property
+    def beat_s(self) -> float:
+        return time.monotonic() - self.silent_s
 
     def request_sweep(self) -> bool:
         if self.status.refusal:
@@ -164,6 +172,44 @@ async def test_health_is_degraded_and_names_every_reason(tmp_path: Path, disk: S
     assert scanner == "the scanner is not connected: /dev/ttyUSB0: no such device"
     assert full == f"the disk is nearly full: {EASY_BYTES - 1} bytes are free"
     assert unsound.startswith("the library holds what is no sound scan: holiday: ")
+
+
+async def test_health_says_when_a_sweep_runs_and_when_a_thread_is_stuck(tmp_path: Path, disk: SimpleNamespace) -> None:
+    table = Turntable()
+    async with served(Library(tmp_path), table) as (node, _):
+        table.status = CaptureStatus("sweeping", 0.5)
+        assert (await ask(node, "/healthz"))[1]["status"] == "capturing"
+        table.silent_s = health.STUCK_S + 1
+        _, said = await ask(node, "/healthz")
+    assert said["status"] == "degraded"
+    assert said["reasons"] == [f"the capture thread has not moved for {health.STUCK_S + 1:.0f} s"]
+
+
+async def test_health_says_when_the_audit_log_cannot_be_written(tmp_path: Path, disk: SimpleNamespace) -> None:
+    library = Library(tmp_path)
+    (tmp_path / "audit").write_text("no folder")
+    async with served(library) as (node, server):
+        await ask(node, "/v1/scans")
+        async with asyncio.timeout(10):
+            while not server.audit.trouble:
+                await asyncio.sleep(0.01)
+        _, said = await ask(node, "/healthz")
+    assert said["reasons"] == ["the audit log cannot be written: Not a directory"]
+
+
+@pytest.mark.parametrize(
+    ("left_s", "reasons"),
+    [
+        (15 * 86400.0, ()),
+        (3 * 86400.0, ("the certificate ends in 3 days",)),
+        (-1.0, ("the certificate has ended: clients refuse it",)),
+    ],
+)
+def test_health_says_when_the_certificate_ends(
+    tmp_path: Path, disk: SimpleNamespace, left_s: float, reasons: tuple[str, ...]
+) -> None:
+    said = health.examine_health(CaptureStatus("no scanner"), Library(tmp_path), {}, "", 1e9 + left_s, 1e9)
+    assert said.reasons == reasons
 
 
 async def test_health_of_a_node_that_stops_is_503(tmp_path: Path, disk: SimpleNamespace) -> None:
