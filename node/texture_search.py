@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from node.coded import Coded, framed, message_overhead
 from node.library import Scan
@@ -79,20 +80,23 @@ class TextureSearch:
         self.limited = False
         self.mse: float | None = None
 
+    @cached_property
+    def _held_mse(self) -> float:
+        """Error per value in the window as it is held; infinite where nobody knows."""
+        return math.inf if self._model is None else self._error(None)
+
     def expected_mse(self, limit_bytes: float) -> float:
         """Error per value expected in the window when the refinement may take so many bytes on the wire; 0: none."""
         choice = self._choose(limit_bytes - OVERHEAD_BYTES, None)
-        if choice is not None:
-            return choice.mse
-        return self._error(None) if self._model is not None else self._target_mse * NO_TEXTURE**2
+        return choice.mse if choice is not None else min(self._held_mse, self._target_mse * NO_TEXTURE**2)
 
     def search(self, aim_bytes: float, limit_bytes: float) -> Coded | None:
         """The cheapest refinement that reaches the quality, else the best one that fits. None: nothing is sent.
 
         aim_bytes : what it should take on the wire, if it cannot reach the quality.   limit_bytes : what it may.
         """
-        if self._model is not None and (held := self._error(None)) <= HELD_MARGIN * self._target_mse:
-            self.mse = held
+        if self._held_mse <= HELD_MARGIN * self._target_mse:
+            self.mse = self._held_mse
             return None
         listed = listed_texture(self._state, self._region, self._target_mse)
         found = self._search_spacings(aim_bytes, limit_bytes, listed)
@@ -131,8 +135,12 @@ class TextureSearch:
         return expected.size_bytes(expected.quality_for_mse(self._target_mse))
 
     def _choose(self, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
-        """The spacing that takes least to reach the target; where none does, the one that comes nearest to it."""
-        choices = [choice for p in self._spacings() if (choice := self._offer(p, aim_bytes, listed)) is not None]
+        """The spacing that takes least to reach the target; where none does, the one that comes nearest to it.
+
+        None where none fits that is better than what is held.
+        """
+        offers = (self._offer(p, aim_bytes, listed) for p in self._spacings())
+        choices = [offer for offer in offers if offer is not None and offer.mse < self._held_mse]
         reaching = [choice for choice in choices if choice.reaches]
         if not reaching:
             return min(choices, key=lambda choice: choice.mse, default=None)
@@ -178,7 +186,8 @@ class TextureSearch:
                 p = 2 * p if best is None else 0
             else:
                 p = p // 2 if found.mse > self._target_mse and not search.limited else 0
-        if best is None:
+        if best is None or best.mse >= self._held_mse:
+            self.mse = self._held_mse if math.isfinite(self._held_mse) else None
             return None
         self.mse = best.mse
         return best.coded

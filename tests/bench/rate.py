@@ -2,6 +2,7 @@
 
 Limits are shares of what the update takes without one. A limit below 1 binds before the quality is reached, and what
 counts then is the fill; overshoot is counted on the WebSocket, where the closing message alone takes some 130 bytes.
+At the end what the joint choice gains over a fixed quality (joint.py).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import asyncio
 from statistics import mean
 from typing import Any
 
+from tests.bench import joint
 from tests.bench.ours import look, node_with
 from tests.bench.scans import BenchScan
 from tests.bench.target import Target
@@ -31,6 +33,7 @@ def run(scans: list[BenchScan], size: str, clicks: int) -> dict[str, Any]:
         "fill_least": min((row["fill"] for row in binding), default=None),
         "over": sum(row["bytes"] > row["limit"] and row["refinements"] > 0 for row in limited),
         "below_the_reply": sum(row["bytes"] > row["limit"] and row["refinements"] == 0 for row in limited),
+        "joint": joint.run(scans, clicks),
     }  # fmt: skip
 
 
@@ -65,7 +68,8 @@ def told(record: dict[str, Any]) -> str:
         f"{record['size']}: encodes an update {record['encodes_mean']:.2f} in the mean"
         f" ({record['encodes_mean_limited']:.2f} under a limit), {record['encodes_most']} at most; {fill};"
         f" over the limit {record['over']} times (and {record['below_the_reply']} limits were below an empty reply)",
-        "", "| scan | limit | bytes | fill | encodes | texture dB | range mm |", "|---" * 7 + "|",
+        joint.told(record["joint"]), "",
+        "| scan | limit | bytes | fill | encodes | texture dB | range mm |", "|---" * 7 + "|",
     ]  # fmt: skip
     for row in record["rows"]:
         limit, full = (row["limit"], f"{row['fill']:.1%}") if row["limit"] else ("none", "")
