@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -70,20 +71,31 @@ class Cap(Region):
         return float(self.row_width @ self.row_share)
 
     def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
-        """Which of rows x columns (not wrapped) lie in it. (rows, columns) bool"""
+        """Which of rows x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
         row = np.clip(rows - self.top, 0, self.height - 1)
         width = np.where((rows >= self.top) & (rows < self.top + self.height), self.row_width[row], 0)
-        away = (columns - self.row_left[row][:, None]) % self.turn
-        return np.asarray(away < width[:, None])
+        turn = self.turn
+        first = (columns[:1] - self.row_left[row])[:, None] % turn
+        away = first + (columns - columns[:1])
+        if columns.size and columns[-1] - columns[0] < turn:  # no division for every sample: they are many
+            return np.asarray((away < width[:, None]) | ((away >= turn) & (away < width[:, None] + turn)))
+        return np.asarray(away % turn < width[:, None])
 
     def touched(self, side: int) -> BoolArray:
-        """Which blocks of the rectangle round it it touches. (rows, columns) bool"""
-        left, top, wide, high = self.blocks(side)
-        first, count = blocks_touched(self.row_left, self.row_width, side, self.turn)
-        columns = -(-self.turn // side)
-        crosses = (left + np.arange(wide) - first[:, None]) % columns < count[:, None]
-        starts = np.maximum(side * (top + np.arange(high)) - self.top, 0)
-        return np.asarray(np.logical_or.reduceat(crosses, starts, axis=0))
+        """Which blocks of that rectangle it touches. (rows, columns) bool"""
+        return _touched(self, side)
+
+
+@lru_cache(maxsize=16)
+def _touched(cap: Cap, side: int) -> BoolArray:
+    left, top, wide, high = cap.blocks(side)
+    first, count = blocks_touched(cap.row_left, cap.row_width, side, cap.turn)
+    columns = -(-cap.turn // side)
+    crosses = (left + np.arange(wide) - first[:, None]) % columns < count[:, None]
+    starts = np.maximum(side * (top + np.arange(high)) - cap.top, 0)
+    touched = np.asarray(np.logical_or.reduceat(crosses, starts, axis=0))
+    touched.flags.writeable = False
+    return touched
 
 
 def blocks_touched(left: IntArray, width: IntArray, side: int, turn: int) -> tuple[IntArray, IntArray]:
