@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -83,19 +83,19 @@ class Cap(Region):
 
     def touched(self, side: int) -> BoolArray:
         """Which blocks of that rectangle it touches. (rows, columns) bool"""
-        return _touched(self, side)
+        if side not in self._touched:
+            left, top, wide, high = self.blocks(side)
+            first, count = blocks_touched(self.row_left, self.row_width, side, self.turn)
+            columns = -(-self.turn // side)
+            crosses = (left + np.arange(wide) - first[:, None]) % columns < count[:, None]
+            starts = np.maximum(side * (top + np.arange(high)) - self.top, 0)
+            self._touched[side] = np.asarray(np.logical_or.reduceat(crosses, starts, axis=0))
+            self._touched[side].flags.writeable = False
+        return self._touched[side]
 
-
-@lru_cache(maxsize=16)
-def _touched(cap: Cap, side: int) -> BoolArray:
-    left, top, wide, high = cap.blocks(side)
-    first, count = blocks_touched(cap.row_left, cap.row_width, side, cap.turn)
-    columns = -(-cap.turn // side)
-    crosses = (left + np.arange(wide) - first[:, None]) % columns < count[:, None]
-    starts = np.maximum(side * (top + np.arange(high)) - cap.top, 0)
-    touched = np.asarray(np.logical_or.reduceat(crosses, starts, axis=0))
-    touched.flags.writeable = False
-    return touched
+    @cached_property
+    def _touched(self) -> dict[int, BoolArray]:
+        return {}
 
 
 def blocks_touched(left: IntArray, width: IntArray, side: int, turn: int) -> tuple[IntArray, IntArray]:
