@@ -120,6 +120,13 @@ class Library(Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(f"library.folder: {problem}; write an absolute path") from problem
 
 
+class Retention(Struct, frozen=True, forbid_unknown_fields=True):
+    """[retention]: when scans are deleted; never one that is pinned or open. None: for ever."""
+
+    max_age_days: Annotated[float, Meta(ge=1, le=36500)] | None = None  # older scans and interrupted sweeps go
+    max_gb: Annotated[float, Meta(ge=0.1, le=1e6)] | None = None  # [GB] where scans take more, the oldest go
+
+
 class Audit(Struct, frozen=True, forbid_unknown_fields=True):
     """[audit]: the history of who saw, changed, exported and deleted what."""
 
@@ -168,6 +175,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     server: Server = Server()
     limits: Limits = Limits()
     library: Library = Library()
+    retention: Retention = Retention()
     audit: Audit = Audit()
     first_view: FirstView = FirstView()
     planner: Planner = Planner()

@@ -87,6 +87,7 @@ class Connection:
         self._codecs: tuple[m.CodecName, ...] = ("htj2k",)
         self._geometries: tuple[Geometry, ...] = ()
         self._bound: Bound | None = None
+        self._is_gone = False
         self._epoch = 0
         self._opens: deque[m.Open] = deque()
         self._look: m.Look | None = None
@@ -118,6 +119,16 @@ class Connection:
     def is_ending(self) -> bool:
         """Whether goodbye was said."""
         return self._session.phase is Phase.CLOSED or self._socket.closed
+
+    @property
+    def scan_id(self) -> str | None:
+        """The scan that is open."""
+        return self._bound.scan.id if self._bound else None
+
+    def forget(self, scan_id: str) -> None:
+        """A scan was deleted: nothing more of it is shown, what the client has cannot be called back."""
+        if self.scan_id == scan_id:
+            self._bound, self._is_gone = None, True
 
     def publish(self, scan_id: str) -> None:
         """Tell the client of a new scan, when it is listening."""
@@ -290,7 +301,8 @@ class Connection:
     async def _answer_look(self, look: m.Look) -> None:
         bound = self._bound
         if bound is None:
-            await self._send(m.Refused(look.request, "not open", "open a scan first"))
+            why = "the scan was deleted: open another" if self._is_gone else "open a scan first"
+            await self._send(m.Refused(look.request, "not open", why))
             return
         self._running_look = look
         started_s = time.monotonic()

@@ -263,6 +263,18 @@ class Journals:
         return sweep
 
 
+def survey_sweeps(folder: Path) -> list[Interrupted]:
+    """The interrupted sweeps in a folder, and one that runs; nothing is changed. Raises LibraryError."""
+    found: list[Interrupted] = []
+    try:
+        for path in sorted(folder.glob(f"*{SUFFIX}")):
+            with suppress(LibraryError):  # no journal: `Journals` names it
+                found.append(replace(survey_journal(path.stem, _map(path)), ended_unix_s=path.stat().st_mtime))
+    except OSError as error:
+        raise disk_error(f"the folder {folder} cannot be used", error) from error
+    return found
+
+
 def needed_bytes(header: SweepHeader) -> int:
     """What a sweep takes on disk until it is published: its journal and its scan. [bytes]"""
     spec = header.spec

@@ -22,8 +22,9 @@ from protocol.errors import LibraryError
 from protocol.printable import counted, printable
 
 if TYPE_CHECKING:
-    from node.config import Config
+    from node.config import Config, Retention
     from node.library import Library, ScanSummary
+    from node.retention import Expired
 
 SCAN_HELP = "the id, the beginning of one, or latest"
 
@@ -45,6 +46,11 @@ def add_library_command(subparsers: argparse._SubParsersAction[argparse.Argument
     backup = _add(actions, "backup", run_backup, "write scans into one new file, a plain tar")
     backup.add_argument("file", type=Path, help="the file to write; it must not exist")
     backup.add_argument("scan", nargs="*", help=f"only these: {SCAN_HELP}")
+    prune = _add(actions, "prune", run_prune, "delete what the rules of [retention] say; a node does so by itself")
+    prune.add_argument("--dry-run", action="store_true", help="only say what would go; also while a node runs")
+    prune.add_argument("--max-age-days", type=float, metavar="D", help="instead of the setting: 1..36500")
+    prune.add_argument("--max-gb", type=float, metavar="GB", help="instead of the setting: what scans may take")
+    prune.add_argument("--yes", action="store_true", help="do not ask")
     restore = _add(actions, "restore", run_restore, "take in the scans of a backup: all or none")
     restore.add_argument("file", type=Path, help="a file that `backup` wrote")
 
@@ -113,6 +119,44 @@ def run_delete(args: argparse.Namespace) -> int:
         library.delete(scan_id)
     note_at_console(_config(args), "deleted", (scan_id,))
     return _tell(args, {"deleted": scan_id}, f"deleted {scan_id}")
+
+
+def run_prune(args: argparse.Namespace) -> int:
+    """Delete what was kept long enough, after saying what that is."""
+    from node.config import load_config
+    from node.retention import delete
+
+    rules = {"retention.max_age_days": args.max_age_days, "retention.max_gb": args.max_gb}
+    config = load_config(args.config, {"library.folder": args.library, **rules})
+    found = _expired(_folder(args), config.retention)
+    said = {"expired": [asdict(one) for one in found], "deleted": 0}
+    lines = [f"{one.id}  {one.kind:5}  {one.size_bytes / 1e6:8.1f} MB  {one.why}" for one in found]
+    if args.dry_run or not found:
+        no_rule = config.retention.max_age_days is None and config.retention.max_gb is None
+        none = "there is no rule: set retention.max_age_days or retention.max_gb" if no_rule else "nothing is to go"
+        return _tell(args, said, "\n".join(lines) or none)
+    if not args.yes and not _confirmed("\n".join([*lines, f"Delete {counted(len(found), 'thing')} for good?"])):
+        return 1
+    with _opened(_folder(args)) as library:
+        for one in found:
+            delete(library, one)
+            is_scan = one.kind == "scan"
+            what = one.why if is_scan else f"sweep {one.id}, {one.why}"
+            note_at_console(config, "expired", (one.id if is_scan else "",), what)
+    return _tell(args, {**said, "deleted": len(found)}, f"deleted {counted(len(found), 'thing')}")
+
+
+def _expired(folder: Path, rules: Retention) -> list[Expired]:
+    """What is to go, looked up without the library's lock. Raises LibraryError."""
+    import time
+
+    from node.journal import survey_sweeps
+    from node.library import survey
+    from node.library_folder import SWEEPS
+    from node.retention import expired
+
+    known, _ = survey(folder)
+    return [*expired(folder, known.values(), survey_sweeps(folder / SWEEPS), rules, time.time())]
 
 
 def run_verify(args: argparse.Namespace) -> int:

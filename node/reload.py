@@ -13,6 +13,7 @@ LIVE = frozenset({
     "capture.passes", "capture.overlap", "capture.stride",
     "server.certificate", "server.key", "server.max_clients",
     "planner.cold_start_bytes_s",
+    "retention.max_age_days", "retention.max_gb",
     "log.level",
 })  # fmt: skip
 

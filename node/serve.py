@@ -34,6 +34,7 @@ from node.page import Page
 from node.pairing import PairingRoutes
 from node.proxy import believe
 from node.refine_texture import CODECS
+from node.retention import delete, expired_in
 from node.shared import SharedFoveae
 from node.tls import Tls
 from protocol import messages as m
@@ -48,6 +49,7 @@ HEARTBEAT_S = 20.0
 BODY_MAX_BYTES = 1 << 16
 GOODBYE_S = 1.0
 ACCESS_S = 0.5  # between looks at what other processes changed of tokens and certificate
+RETAIN_S = 600.0  # between looks at what was kept long enough
 RENEW_S = 3600.0  # between looks at the certificate
 REQUESTS_S = 1.0  # that requests in work get to end when the node stops
 ANSWERED = web.RequestKey("answered", bool)  # the head of the answer is made
@@ -90,10 +92,11 @@ class NodeServer:
         self._shared = SharedFoveae(exhibits, shared_cache=c.shared_cache, is_open=c.insecure)
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._hanging_up: set[asyncio.Task[None]] = set()
+        self._requests: dict[int, web.Request] = {}  # those in work, by their id()
         self._gate = Gate(config.limits, is_open=c.insecure, proxies=c.trusted_proxies)
         self._metrics = Metrics()
         exhibits.tell(self._metrics.encoded)
-        middlewares = [self._count, believe(c.trusted_proxies), _explain, self._gate.admit, self._auth.admit]
+        middlewares = [believe(c.trusted_proxies), self._count, _explain, self._gate.admit, self._auth.admit]
         self._app = web.Application(middlewares=middlewares, client_max_size=BODY_MAX_BYTES)
         self._app.on_response_prepare.extend((_harden, audit_routes.witness))
         self._app.on_cleanup.append(self._close_audit)
@@ -126,14 +129,15 @@ class NodeServer:
         await self._runner.setup()
         server, context = self._config.server, self._tls.context if self._tls else None
         host, port = await self._gate.open(self._runner, server.host, server.port, context)
-        self._watching = asyncio.create_task(self._watch_access())
+        self._watching = [asyncio.create_task(self._watch_access()), asyncio.create_task(self._retain())]
         self.audit.note("started", NODE, what=self._info.version)
         return host, port
 
     async def stop(self) -> None:
         """Tell every client, hang up on those that do not listen, then stop listening."""
         self._is_stopping = True
-        self._watching.cancel()
+        for task in self._watching:
+            task.cancel()
         why = "the node is stopping", WSCloseCode.GOING_AWAY
         goodbyes = [asyncio.ensure_future(connection.close(*why)) for connection in self._connections]
         if goodbyes:
@@ -184,6 +188,7 @@ class NodeServer:
     async def _count(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Count every request and its answer."""
         status, size_bytes = 500, 0
+        self._requests[id(request)] = request
         try:
             response = await handler(request)
             status, size_bytes = response.status, response.content_length or 0
@@ -192,6 +197,7 @@ class NodeServer:
             status = redirect.status
             raise
         finally:
+            del self._requests[id(request)]
             self._metrics.answered(request.method, place_of(request), status, size_bytes)
 
     async def _close_audit(self, app: web.Application) -> None:
@@ -219,6 +225,28 @@ class NodeServer:
         """A scan was deleted: nothing made of it is kept here any longer."""
         self._exhibits.forget(scan_id)
         self._shared.void()
+        for connection in self._connections:
+            connection.forget(scan_id)
+
+    async def _retain(self) -> None:
+        """Delete what the rules of retention say, now and then, as long as the node runs."""
+        while True:
+            try:
+                rules, library = self._config.retention, self._exhibits.library
+                for one in await asyncio.to_thread(expired_in, library, rules, self._open_scans()):
+                    if one.id not in self._open_scans():
+                        await asyncio.to_thread(delete, library, one)
+                        self._forget(one.id)
+                        log.warning("retention: deleted %s %s: %s", one.kind, one.id, one.why)
+                        self.audit.note("expired", NODE, **{one.kind: one.id}, what=one.why)
+            except LibraryError as error:
+                log.error("retention: %s", error)
+            await asyncio.sleep(RETAIN_S)
+
+    def _open_scans(self) -> frozenset[str]:
+        """Every scan that somebody looks at or fetches now."""
+        streams = (connection.scan_id for connection in self._connections)
+        return frozenset(filter(None, (*streams, *(request.get(SCAN) for request in self._requests.values()))))
 
     def show_live(self) -> None:
         """Send every client that watches what is new in the running sweep."""

@@ -13,7 +13,7 @@ import aiohttp
 from client.trust import certificate_pin
 from node.access import Access, access_folder
 from node.coarse import FIRST_VIEW_BYTES
-from node.config import Config, Limits, Server
+from node.config import Config, Limits, Retention, Server
 from node.exhibits import Exhibits
 from node.library import About, Library
 from node.live import Live
@@ -24,7 +24,7 @@ from protocol import pairing
 from tests.node.scans import make_grid
 
 ANY_PORT = Server(listen="127.0.0.1:0")
-LIMITS = Limits()
+LIMITS, KEEP_ALL = Limits(), Retention()
 INFO = m.ServerInfo(m.PROTOCOL, "n1", "<node & co>", "0", login=True)
 
 
@@ -59,9 +59,11 @@ class Entrance:
 
 
 @asynccontextmanager
-async def entrance(folder: Path, settings: Server = ANY_PORT, limits: Limits = LIMITS) -> AsyncIterator[Entrance]:
+async def entrance(
+    folder: Path, settings: Server = ANY_PORT, limits: Limits = LIMITS, retention: Retention = KEEP_ALL
+) -> AsyncIterator[Entrance]:
     """A node without a scanner, with one scan."""
-    config = Config(server=settings, limits=limits)
+    config = Config(server=settings, limits=limits, retention=retention)
     with closing(Library(folder)) as library, closing(Exhibits(library, FIRST_VIEW_BYTES, workers=1)) as exhibits:
         scan = library.add(make_grid(40, 24), About(1e9)).id
         place = access_folder(folder)

@@ -20,7 +20,10 @@ UNIT = SYSTEMD / "foveascan.service"
 PROGRAM = "/opt/foveascan/bin/foveascan"
 EXPOSURE_MAX = 1.5
 # Nothing by default: the file shows an example.
-OPTIONAL = {"capture.scanner", "discovery.name", "server.certificate", "server.key"}
+OPTIONAL = {
+    "capture.scanner", "discovery.name", "server.certificate", "server.key",
+    "retention.max_age_days", "retention.max_gb",
+}  # fmt: skip
 
 
 def tool(name: str) -> str:
