@@ -28,6 +28,17 @@ def add_node(parser: argparse.ArgumentParser, *, token: bool = True) -> None:
         parser.add_argument("--token", help="instead of what `foveascan join` has kept")
 
 
+def add_closing(parser: argparse._ActionsContainer, sweep: Callable[[str], object], what: str) -> None:
+    """Offer what a cylinder needs to become a sphere. sweep, what : of which type other sweeps are named, and how."""
+    parser.add_argument("--caps", action="store_true", help="of a sphere: make up lids over ends that are open")
+    parser.add_argument("--centre-height", type=number, metavar="MM", help="of a sphere's centre, up the axis (chosen)")
+    parser.add_argument(
+        "--top", type=sweep, metavar=what, help="a sweep of the object tipped over its front, its top towards angle 0"
+    )
+    parser.add_argument("--bottom", type=sweep, metavar=what, help="the same over its back, its bottom there")
+    parser.add_argument("--tip", type=between(0, 180), default=90.0, metavar="DEG", help="how far it was tipped (90)")
+
+
 async def chosen_node(args: argparse.Namespace) -> NodeAddress | str:
     """What --node names, else the one node on this network. Raises NodeLost unless there is one."""
     if args.node:

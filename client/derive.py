@@ -29,14 +29,21 @@ async def derive_scan(
     *,
     caps: bool = False,
     centre_height_mm: float | None = None,
+    top: str | None = None,
+    bottom: str | None = None,
+    tip_deg: float = 90.0,
     token: str | None = None,
 ) -> Derived:
     """Have a node keep a scan ("latest" or an id) in another geometry, as a scan of its own.
 
     caps : make up lids over a cylinder's open ends.  centre_height_mm : of a sphere's centre; None: chosen.
+    top, bottom : scans of the same object tipped by tip_deg, over its front and over its back.
     Raises what `connect` raises: RequestRefused, with the reason, for a scan that cannot be made so.
     """
-    wanted = {"geometry": geometry, "caps": caps, "centreHeightMm": centre_height_mm}
+    wanted = {
+        "geometry": geometry, "caps": caps, "centreHeightMm": centre_height_mm,
+        "top": top, "bottom": bottom, "tipDeg": tip_deg,
+    }  # fmt: skip
     async with logged_in(node, token) as (url, http):
         said = await ask(http, "POST", f"{url}/v1/scans/{scan}/derive", wanted, TIMEOUT)
     try:

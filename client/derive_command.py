@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from client.arguments import add_node, chosen_node, number
+from client.arguments import add_closing, add_node, chosen_node
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -20,10 +20,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     derive.add_argument(
         "--geometry", choices=("cylinder", "sphere"), default="sphere", help="what to make of it (sphere)"
     )
-    derive.add_argument("--caps", action="store_true", help="of a sphere: make up lids over ends that are open")
-    derive.add_argument(
-        "--centre-height", type=number, metavar="MM", help="of a sphere's centre, up the axis (chosen)"
-    )
+    add_closing(derive, str, "ID")
     add_node(derive)
     derive.set_defaults(run=run_derive)
 
@@ -44,5 +41,6 @@ async def _derive(args: argparse.Namespace) -> Derived:
 
     return await derive_scan(
         await chosen_node(args), args.scan, args.geometry,
-        caps=args.caps, centre_height_mm=args.centre_height, token=args.token,
+        caps=args.caps, centre_height_mm=args.centre_height, top=args.top, bottom=args.bottom, tip_deg=args.tip,
+        token=args.token,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from client.arguments import add_node, chosen_node, number, positive
+from client.arguments import add_closing, add_node, chosen_node, number, positive
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def run_import(args: argparse.Namespace) -> int:
 
     if args.output:
         _check_grid(args.output)
+    options = _read_options(args)
     with _bar(args, "reading") as moved:
-        options = _read_options(args)
         found = read_scan(args.file, args.texture, options, lambda share: moved(round(1000 * share), 1000))
     found = found._replace(name=args.name or found.name)
     spec = found.grid.spec
@@ -114,12 +114,15 @@ def _write(path: Path, found: Scanned) -> None:
 
 
 def _read_options(args: argparse.Namespace) -> ReadOptions:
-    from exchange.formats import ReadOptions
+    from exchange.formats import ReadOptions, read_surface
     from exchange.mesh_file import Placing
+    from exchange.sweeps import Sweep
 
     placing = Placing(args.up, args.unit_mm, args.centre)
     theta0_rad = math.radians(args.theta0_deg)
-    return ReadOptions(args.size, placing, theta0_rad, args.geometry, args.caps, args.centre_height)
+    given = {args.bottom: -args.tip, args.top: args.tip}  # of one that lay on its side, and saw both ends, the first
+    sweeps = tuple(Sweep(read_surface(path, placing), tip_deg) for path, tip_deg in given.items() if path is not None)
+    return ReadOptions(args.size, placing, theta0_rad, args.geometry, args.caps, args.centre_height, sweeps)
 
 
 @contextmanager
@@ -142,12 +145,7 @@ def _add_geometry(parser: argparse.ArgumentParser) -> None:
     geometry.add_argument(
         "--geometry", choices=("cylinder", "sphere"), help="(a grid as it is; a mesh as a sphere if it is closed)"
     )
-    geometry.add_argument(
-        "--caps", action="store_true", help="of a cylinder as a sphere: make up lids over ends that are open"
-    )
-    geometry.add_argument(
-        "--centre-height", type=number, metavar="MM", help="of a sphere's centre, up the axis (chosen)"
-    )
+    add_closing(geometry, Path, "FILE")
 
 
 def _add_mesh(parser: argparse.ArgumentParser) -> None:

@@ -15,9 +15,10 @@ from enum import IntEnum
 import cv2
 import numpy as np
 
-from exchange.cast import Mesh, cast_mesh, to_steps
+from exchange.cast import cast_mesh, to_steps
 from exchange.ends import POINTS, SIDES, End, find_end, lid_colours, paint_lid, with_end
 from exchange.errors import ExchangeError
+from exchange.fit import Fit
 from exchange.profile import columns_mm, meet, profiles, sample_rows, strips
 from exchange.rays import LevelRays, StarRays
 from exchange.star import (
@@ -30,11 +31,14 @@ from exchange.star import (
     nearest_round,
     solid_share,
 )
+from exchange.sweeps import Sweep, surface_towards
 from protocol.grid import HEIGHT_MAX, STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray
 from protocol.rings import thin_grid
+from protocol.sphere import DirectionGrid
 
 COLUMNS_LOOKED_AT = 180  # tell where a centre may stand and how many rows are needed
 EDGE_ON_ROWS = 4.0  # samples further apart than that, as the centre sees them, say little of what is between them
+REACH_MARGIN = 1.25  # of what the scan reaches: so much more may another sweep
 ROWS_OF = 8  # rows come in whole blocks
 TEXEL_ROWS_OF = 16
 _NO_TEXTURE = np.zeros((1, 1, 3), np.uint8)
@@ -47,7 +51,7 @@ class Closed:
     """What a scan became as a sphere. hidden : share of its surface.  All others : shares of all directions.
 
     centre_mm : height of the centre.  open : void.  swept : from the other sweeps.  rounded : on round ends, which meet
-    the axis within a row.  capped : made up.
+    the axis within a row.  capped : made up.  misfit_mm : how far those sweeps lie from the scan, root mean square.
     """
 
     centre_mm: float
@@ -56,12 +60,13 @@ class Closed:
     swept: float
     rounded: float
     capped: float
+    misfit_mm: float = 0.0
 
     def __str__(self) -> str:
         parts = (
             (self.hidden, "of the surface hidden from there"),
             (self.open, "of all directions void"),
-            (self.swept, "from other sweeps"),
+            (self.swept, f"from other sweeps, which fit within {self.misfit_mm:.2g} mm"),
             (self.rounded, "between the last row of a round end and the axis"),
             (self.capped, "made up: caps over open ends"),
         )
@@ -77,12 +82,12 @@ class _Source(IntEnum):
     EDGE_ON = 2
     ROUND = 3
     CAP = 4
-    SWEEP = 5
+    SWEEP = 5  # the first of them, the second 6
 
 
 def close_scan(
     grid: Grid,
-    sweeps: Sequence[Mesh] = (),
+    sweeps: Sequence[Sweep] = (),
     *,
     caps: bool = False,
     centre_mm: float | None = None,
@@ -90,19 +95,23 @@ def close_scan(
 ) -> tuple[Grid, Closed]:
     """A cylindrical scan as a spherical one of its resolution.
 
-    sweeps : other surfaces of the same object, in the scan's frame.  caps : make up a lid over an end that is open.
+    sweeps : of the same object when it was tipped; they are fitted to the scan (exchange.fit).  caps : make up a lid
+    over an end that is open.
     centre_mm : height of the centre on the axis; None: chosen.  progress : told the share done, 0..1.
-    Raises ExchangeError for a grid that is no cylinder, a centre outside, or more than HIDDEN_MAX hidden from it.
+    Raises ExchangeError for a grid that is no cylinder, a centre outside, more than HIDDEN_MAX hidden from it, or a
+    sweep that does not fit.
     """
     if grid.spec.geometry != "cylinder":
         raise ExchangeError(f"scan: is a {grid.spec.geometry} already")
     top, bottom = (find_end(grid.spec, grid.range_steps, side, cap=caps) for side in SIDES)
-    view = _View(grid, (top, bottom), _fitted(grid, sweeps, (top, bottom), centre_mm))
-    others = [cast_mesh(mesh, view.spec) for mesh in sweeps]
-    range_mm, source = _ranges(view, others)
+    view = _View(grid, (top, bottom), _fitted(grid, (top, bottom), centre_mm, REACH_MARGIN if sweeps else 1.0))
+    fits = [sweep.fitted(grid) for sweep in sweeps]
+    range_mm, source = _ranges(view)
     progress(0.2)
+    others = [_look_at(view, sweep, found, source) for sweep, found in zip(sweeps, fits, strict=True)]
+    _fill(range_mm, source, others)
     spec = replace(view.spec, pitch_mm=math.pi * float(np.nanmean(range_mm)) / view.spec.height)
-    texture = _texture(view, others, lambda share: progress(0.2 + 0.8 * share))
+    texture = _texture(view, source, others, lambda share: progress(0.2 + 0.8 * share))
     closed = thin_grid(Grid(spec, to_steps(range_mm, spec.step_mm), texture))
     hidden = _hidden(view, closed)
     if hidden > HIDDEN_MAX:
@@ -110,9 +119,10 @@ def close_scan(
             f"scan: {hidden:.1%} of its surface is hidden from its centre, more than {HIDDEN_MAX:.0%}; "
             "it is not star-shaped: keep it as a cylinder"
         )
-    swept, rounded, capped = (solid_share(source == kind) for kind in (_Source.SWEEP, _Source.ROUND, _Source.CAP))
+    swept, rounded, capped = map(solid_share, (source >= _Source.SWEEP, source == _Source.ROUND, source == _Source.CAP))
     is_void = np.equal(closed.range_steps, VOID)
-    return closed, Closed(spec.z_max_mm, hidden, solid_share(is_void), swept, rounded, capped)
+    misfit_mm = max((found.misfit_mm for found in fits), default=0.0)
+    return closed, Closed(spec.z_max_mm, hidden, solid_share(is_void), swept, rounded, capped, misfit_mm)
 
 
 def closes(grid: Grid) -> bool:
@@ -182,23 +192,36 @@ class _View:
         return far
 
 
-def _ranges(view: _View, others: Sequence[Grid]) -> tuple[FloatArray, IntArray]:
+def _ranges(view: _View) -> tuple[FloatArray, IntArray]:
     """Range of all directions (H, W) [mm], NaN = void, and where it comes from."""
     width, height = view.spec.width, view.spec.height
     range_mm, source = np.full((height, width), np.nan), np.zeros((height, width), np.int64)
     for columns in view.strips(height, width):
         seen = view.look(columns, width, height)
         range_mm[:, columns], source[:, columns] = seen.range_mm, seen.source
-    for other in others:
-        taken = (source != _Source.SAMPLES) & (source != _Source.SWEEP) & (other.range_steps != VOID)
-        range_mm[taken], source[taken] = other.range_steps[taken] * view.spec.step_mm, _Source.SWEEP
     if np.isnan(range_mm).all():
         raise ExchangeError("scan: nothing is measured")
     return range_mm, source
 
 
-def _texture(view: _View, others: Sequence[Grid], progress: Progress) -> ImageArray:
-    """Colours of all directions, black where nothing is. (Ht, Wt, 3) uint8"""
+def _look_at(view: _View, sweep: Sweep, found: Fit, source: IntArray) -> Grid | None:
+    """A sweep as the centre sees it, where the scan itself has nothing good."""
+    spec = view.spec
+    poor = np.not_equal(source, _Source.SAMPLES)
+    mesh = surface_towards(sweep, found, poor, DirectionGrid.of(spec), spec.z_max_mm)
+    return None if mesh is None else cast_mesh(mesh, spec)
+
+
+def _fill(range_mm: FloatArray, source: IntArray, others: Sequence[Grid | None]) -> None:
+    """Take from sweeps what the scan does not have, or saw edge-on."""
+    for n, other in enumerate(others):
+        if other is not None:
+            taken = (source != _Source.SAMPLES) & (source < _Source.SWEEP) & (other.range_steps != VOID)
+            range_mm[taken], source[taken] = other.range_mm[taken], _Source.SWEEP + n
+
+
+def _texture(view: _View, ranges: IntArray, others: Sequence[Grid | None], progress: Progress) -> ImageArray:
+    """Colours of all directions, black where nothing is. (Ht, Wt, 3) uint8   ranges : where range comes from."""
     width, height = view.spec.texture_width, view.spec.texture_height
     texture = np.zeros((height, width, 3), np.uint8)
     source = np.zeros((height, width), np.uint8)
@@ -215,11 +238,21 @@ def _texture(view: _View, others: Sequence[Grid], progress: Progress) -> ImageAr
         strip[seen.source == _Source.VOID] = 0
         texture[:, columns], source[:, columns] = strip, seen.source
         progress(columns.stop / width)
-    for other in others:
-        measured = cv2.resize(np.minimum(other.range_steps, 1), (width, height), interpolation=cv2.INTER_NEAREST)
-        taken = (source != _Source.SAMPLES) & (source != _Source.SWEEP) & (measured > 0)
-        texture[taken], source[taken] = other.texture[taken], _Source.SWEEP
+    for n, other in enumerate(others):
+        if other is not None:
+            _paint(texture, source == _Source.VOID, ranges == _Source.SWEEP + n, other.texture)
     return texture
+
+
+def _paint(texture: ImageArray, void: BoolArray, swept: BoolArray, other: ImageArray) -> None:
+    """Take a sweep's colours where its range was taken, and for void texels beside that."""
+    height, width = void.shape
+    cells = np.pad(swept.astype(np.uint8), ((0, 0), (1, 1)), mode="wrap")
+    beside = cv2.dilate(cells, np.ones((3, 3), np.uint8))[:, 1:-1]
+    size = width, height
+    here, near = (cv2.resize(of, size, interpolation=cv2.INTER_NEAREST) > 0 for of in (cells[:, 1:-1], beside))
+    taken = here | (near & void)
+    texture[taken] = other[taken]
 
 
 def _hidden(view: _View, closed: Grid) -> float:
@@ -249,7 +282,7 @@ def _area(out: FloatArray, z: FloatArray) -> FloatArray:
 
 
 def _fitted(
-    grid: Grid, sweeps: Sequence[Mesh], ends: tuple[End | None, End | None], centre_mm: float | None
+    grid: Grid, ends: tuple[End | None, End | None], centre_mm: float | None, margin: float
 ) -> GridSpec:
     """Geometry of a sphere about a centre that is inside, as dense as the scan. Raises ExchangeError."""
     spec = grid.spec
@@ -268,7 +301,7 @@ def _fitted(
     rows = 1 / float(np.median(turn)) if turn.size else spec.height
     height = _whole(rows, ROWS_OF)
     texture_height = _whole(height * spec.texture_height / spec.height, TEXEL_ROWS_OF)
-    reach_mm = _reach(grid, sweeps, ends, centre_mm)
+    reach_mm = margin * _reach(grid, ends, centre_mm)
     step_mm = max(spec.step_mm, reach_mm / (STEPS_MAX - 1))
     try:
         return GridSpec(
@@ -307,12 +340,10 @@ def _whole(rows: float, of: int) -> int:
     return min(max(of * math.ceil(rows / of), of), HEIGHT_MAX)
 
 
-def _reach(grid: Grid, sweeps: Sequence[Mesh], ends: tuple[End | None, End | None], centre_mm: float) -> float:
+def _reach(grid: Grid, ends: tuple[End | None, End | None], centre_mm: float) -> float:
     """The furthest that anything is from the centre. [mm]"""
     spec = grid.spec
     furthest = grid.range_steps.max(axis=1) * spec.step_mm
     up = spec.height_mm(np.arange(spec.height)) - centre_mm
     reach = float(np.hypot(furthest, up)[furthest > 0].max())
-    reach = max([reach, *(abs(end.apex_mm - centre_mm) for end in ends if end is not None)])
-    corners = (np.linalg.norm(mesh.corners - np.array([0, 0, centre_mm]), axis=-1).max() for mesh in sweeps)
-    return max([reach, *(float(corner) for corner in corners)])
+    return max([reach, *(abs(end.apex_mm - centre_mm) for end in ends if end is not None)])

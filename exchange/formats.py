@@ -12,8 +12,10 @@ from exchange.errors import ExchangeError
 from protocol.grid import Geometry, Grid, ImageArray
 
 if TYPE_CHECKING:
+    from exchange.cast import Mesh
     from exchange.mesh_file import Placing
     from exchange.native import Scanned
+    from exchange.sweeps import Sweep
 
 Writer = Callable[[Grid, BinaryIO], None]
 Size = tuple[int, int, int, int]  # W, H, Wt, Ht
@@ -44,7 +46,8 @@ class ReadOptions:
     size : W, H, Wt, Ht a mesh is cast on.  placing : of one; None: as its format demands.  theta0_rad : see fit_spec.
     geometry : as what it is wanted; None: a grid as it is, a mesh as a sphere if it is closed and hides little of
     itself from its centre, else as a cylinder.  caps : make up lids over a cylinder's open ends (exchange.closing).
-    centre_mm : height of a sphere's centre; None: chosen.  Raises ExchangeError for what only a sphere has.
+    centre_mm : height of a sphere's centre; None: chosen.  sweeps : others of the object, for what a cylinder does not
+    see.  Raises ExchangeError for what only a sphere has.
     """
 
     size: Size = SIZES["M"]
@@ -53,10 +56,11 @@ class ReadOptions:
     geometry: Geometry | None = None
     caps: bool = False
     centre_mm: float | None = None
+    sweeps: tuple[Sweep, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.geometry != "sphere" and (self.caps or self.centre_mm is not None):
-            raise ExchangeError("caps and a centre go with a sphere: --geometry sphere")
+        if self.geometry != "sphere" and (self.caps or self.centre_mm is not None or self.sweeps):
+            raise ExchangeError("caps, a centre and other sweeps go with a sphere: --geometry sphere")
 
 
 def suffix_of(name: str | Path) -> str:
@@ -127,14 +131,30 @@ def as_wanted(
     from exchange.unrolling import unroll
 
     if options.geometry in (None, found.grid.spec.geometry):
+        if options.sweeps or options.caps:
+            raise ExchangeError(f"scan: is a {found.grid.spec.geometry} already")
         return found
     if options.geometry == "cylinder":
         return found._replace(grid=unroll(found.grid), note=joined(found.note, "a sphere as its axis sees it"))
     repaired = f"{len(found.grid.repairs)} samples of it were repaired" if found.grid.repairs.size else ""
     closed, said = close_scan(
-        found.grid, caps=options.caps, centre_mm=options.centre_mm, progress=progress
+        found.grid, options.sweeps, caps=options.caps, centre_mm=options.centre_mm, progress=progress
     )
     return found._replace(grid=closed, note=joined(found.note, str(said), repaired))
+
+
+def read_surface(path: Path, placing: Placing | None = None) -> Grid | Mesh:
+    """A file for a Sweep: a cylindrical grid, an Echo file, or a mesh, centred on the axis. Raises as `read_scan`."""
+    from exchange.mesh_file import SUFFIXES, Placing, read_mesh
+    from exchange.points import Points
+
+    if path.suffix.lower() not in SUFFIXES:
+        return read_scan(path).grid
+    given = placing or Placing()
+    found = read_mesh(path, Placing(given.up, given.unit_mm, centred=True))
+    if isinstance(found, Points):
+        raise ExchangeError(f"{path}: points without triangles show no surface")
+    return found
 
 
 def joined(*notes: str) -> str:
@@ -153,6 +173,8 @@ def _read_mesh(
 
     if path.suffix.lower() not in SUFFIXES:
         raise ExchangeError(f"no scan: expected an Echo file, .npz, {', '.join(SUFFIXES)}")
+    if options.sweeps:
+        raise ExchangeError("mesh: sweeps complete a cylindrical scan, not a mesh")
     found = read_mesh(path, options.placing or Placing(), texture)
     if isinstance(found, Points):
         if options.geometry == "sphere":

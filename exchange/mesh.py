@@ -142,6 +142,12 @@ class GridMesh:
             band = Band(0, 1) if lid[0, 0] == 0 else Band(self.grid.spec.height - 1, self.grid.spec.height)
             yield self.positions(band)[lid - self._row_start[band.first]]
 
+    def textured_bands(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """The same without lids, and their texture coordinates. (m, 3, 3), (m, 3, 2) each"""
+        for band in self._quad_bands():
+            numbers = self._number(band)[self._corners(band)] - self._row_start[band.first]
+            yield self.positions(band)[numbers], self.texture_coordinates(band)[numbers]
+
     def _lids(self) -> Iterator[IntArray]:
         """The triangles that close a sphere's measured first and last rows over the poles, as vertex numbers. (m, 3)"""
         spec = self.grid.spec

@@ -10,7 +10,7 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
 import msgspec
@@ -21,6 +21,7 @@ from exchange.closing import closes
 from exchange.errors import ExchangeError
 from exchange.formats import ReadOptions, as_wanted
 from exchange.native import Scanned
+from exchange.sweeps import TIP_DEG, Sweep
 from node.audit import NODE, Audit
 from node.audit_routes import SCAN, WHAT
 from node.auth import require
@@ -35,15 +36,17 @@ AT_ONCE = 1
 
 
 class Wanted(Struct, frozen=True, forbid_unknown_fields=True, rename="camel"):
-    """What a scan is to become. caps, centre_height_mm : of a sphere, as exchange.formats.ReadOptions has them."""
+    """What a scan is to become. caps, centre_height_mm : of a sphere, as exchange.formats.ReadOptions has them.
+
+    top, bottom : ids of scans of the same object, tipped by tip_deg over its front, and over its back.
+    """
 
     geometry: Geometry
     caps: bool = False
     centre_height_mm: Annotated[float, Meta(ge=-1e6, le=1e6)] | None = None
-
-    def options(self) -> ReadOptions:
-        """The same as the exchange knows it. Raises ExchangeError for what does not go together."""
-        return ReadOptions(geometry=self.geometry, caps=self.caps, centre_mm=self.centre_height_mm)
+    top: Annotated[str, Meta(max_length=200)] | None = None
+    bottom: Annotated[str, Meta(max_length=200)] | None = None
+    tip_deg: Annotated[float, Meta(ge=0, le=180)] = TIP_DEG
 
 
 class Stopping(Exception):
@@ -55,13 +58,28 @@ def derive(library: Library, scan_id: str, wanted: Wanted, progress: Callable[[f
 
     Raises LibraryError for one that is unknown or cannot be kept, ExchangeError for one that cannot be made so.
     """
-    options = wanted.options()
+    others: dict[str, float] = {}
+    for other, tip_deg in _tipped(wanted):
+        others.setdefault(library.resolve(other), tip_deg)  # one that lay on its side has seen both ends
+    sweeps = tuple(Sweep(library.open(other).grid, tip_deg) for other, tip_deg in others.items())
+    options = ReadOptions(
+        geometry=wanted.geometry, caps=wanted.caps, centre_mm=wanted.centre_height_mm, sweeps=sweeps
+    )
     source = library.open(scan_id)
     if wanted.geometry == source.spec.geometry:
         raise ExchangeError(f"scan: is a {wanted.geometry} already")
     found = Scanned(source.about.name, source.grid, source.about.note)
     made = as_wanted(found, options, progress)
-    return library.add(made.grid, About(time.time(), "derived", made.name, note=made.note, made_from=(scan_id,)))
+    about = About(time.time(), "derived", made.name, note=made.note, made_from=(scan_id, *others))
+    return library.add(made.grid, about)
+
+
+def _tipped(wanted: Wanted) -> Iterator[tuple[str, float]]:
+    """The other sweeps that are wanted, and how far the object was tipped over its front in each."""
+    if wanted.top is not None:
+        yield wanted.top, wanted.tip_deg
+    if wanted.bottom is not None:
+        yield wanted.bottom, -wanted.tip_deg
 
 
 class Derivation:

@@ -18,10 +18,13 @@ from node.library import About, Library, content_id
 from node.serve import NodeServer
 from protocol.grid import Grid
 from simulators.nutcracker import nutcracker
+from simulators.pebble import pebble
 from simulators.shapes import cylinder, sphere
+from tests.exchange.tipped import lying, swept
 from tests.node.served import Client, served
 
 SHAPE = (96, 80, 96, 64)
+TIPPED_SHAPE = (240, 120, 240, 120)
 BALL, CAN = sphere(SHAPE, 0), cylinder(SHAPE, 0)
 
 
@@ -84,6 +87,8 @@ async def test_a_sphere_becomes_a_cylinder_on_demand(tmp_path: Path) -> None:
         ({"geometry": "sphere", "centreHeightMm": 500}, 422, "not inside"),
         ({"geometry": "cylinder", "caps": True}, 422, "go with a sphere"),
         ({"geometry": "cone"}, 400, "geometry"),
+        ({"geometry": "cylinder", "top": "latest"}, 422, "go with a sphere"),
+        ({"geometry": "sphere", "tipDeg": 181}, 400, "tipDeg"),
         ({"geometry": "sphere", "lids": True}, 400, "lids"),
         ({}, 400, "geometry"),
         ({"geometry": "sphere", "centreHeightMm": 1e9}, 400, "centreHeightMm"),
@@ -104,6 +109,22 @@ async def test_what_hides_much_of_itself_is_refused_with_a_cure(tmp_path: Path) 
     async with node(tmp_path, nutcracker(SHAPE, 0)) as (client, _, _, [doll]):
         answer = await client.post(f"/v1/scans/{doll}/derive", json={"geometry": "sphere"})
         assert answer.status == 422 and "keep it as a cylinder" in await answer.text()
+
+
+async def test_a_second_sweep_of_the_tipped_object_closes_the_first(tmp_path: Path) -> None:
+    stone = pebble(TIPPED_SHAPE, 0)
+    upright = swept(stone, np.eye(3), np.zeros(3), TIPPED_SHAPE)
+    laid = lying(stone, (4.0, -3.0, 2.0), np.array([1.0, -1.0, 50.0]), TIPPED_SHAPE)
+    async with node(tmp_path, upright, laid, CAN) as (client, _, library, [first, second, can]):
+        said = await derived(client, first, geometry="sphere", top=second[:8], bottom=second)
+        assert "from other sweeps" in said["note"] and "void" not in said["note"]
+        assert library.open(said["id"]).about.made_from == (first, second)
+        alone = await derived(client, first, geometry="sphere")
+        assert "void" in alone["note"]
+        refused = (can, 422, "is it the same"), ("123456", 404, "no scan"), (said["id"], 422, "give the cylinder")
+        for other, status, message in refused:
+            answer = await client.post(f"/v1/scans/{first}/derive", json={"geometry": "sphere", "top": other})
+            assert answer.status == status and message in await answer.text()
 
 
 async def test_a_sweep_of_a_closed_object_is_kept_as_a_sphere_too(tmp_path: Path) -> None:

@@ -7,12 +7,17 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from exchange.formats import read_scan
 from exchange.native import write_native
 from foveascan import PROGRAM, main, started
+from simulators.pebble import pebble
 from simulators.shapes import cylinder
+from tests.exchange.tipped import lying, swept
+
+STONE = (240, 120, 240, 120)
 
 
 @pytest.fixture
@@ -44,6 +49,28 @@ def test_a_cylinder_is_closed_here_as_on_the_node(tmp_path: Path, url: str, caps
     assert " sphere  can\n" in capsys.readouterr().out
     told(capsys, "export", str(tmp_path / "closed.npz"), "--scan", there["scan"], *at_node)
     assert read_scan(tmp_path / "closed.npz").note == there["note"]
+
+
+def test_a_lying_sweep_closes_a_standing_one_here_as_on_the_node(
+    tmp_path: Path, url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stone = pebble(STONE, 0)
+    upright = swept(stone, np.eye(3), np.zeros(3), STONE)
+    laid = lying(stone, (4.0, -3.0, 2.0), np.array([1.0, -1.0, 50.0]), STONE)
+    for name, grid in (("standing", upright), ("lying", laid)):
+        with open(tmp_path / f"{name}.npz", "wb") as file:
+            write_native(grid, file, name)
+    standing, lying_ = str(tmp_path / "standing.npz"), str(tmp_path / "lying.npz")
+    at_node = ("--node", url)
+    first, second = (told(capsys, "import", file, *at_node)["scan"] for file in (standing, lying_))
+    to_sphere = ("--geometry", "sphere", *at_node)
+    here = told(capsys, "import", standing, "--top", lying_, "--bottom", lying_, *to_sphere)
+    there = told(capsys, "derive", "--scan", first, "--top", second[:6], *to_sphere)
+    assert here == there and "from other sweeps" in here["note"]
+    assert main(["import", standing, "--bottom", lying_, *to_sphere]) == 1  # it lay over its front
+    assert "tipped as said?" in capsys.readouterr().err
+    assert main(["import", standing, "--top", str(tmp_path / "none.npz"), *to_sphere]) == 1
+    assert "none.npz" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
