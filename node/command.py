@@ -25,6 +25,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     serve.add_argument("--scanner", metavar="ADDRESS", help=f"{ADDRESS}; none: library only")
     serve.add_argument("--baud", type=_baud, help="its speed in baud, 9600..12000000 (3000000)")
     serve.add_argument("--name", help="name to announce on the network (this host's)")
+    serve.add_argument("--log", choices=("auto", "text", "json"), help="how the log is written; auto: as text (auto)")
     serve.add_argument("--check", action="store_true", help="only say whether the settings are sound")
     serve.add_argument("--json", action="store_true", help="print one JSON object once the node is ready")
     serve.set_defaults(run=run_serve)
@@ -60,7 +61,7 @@ def run_serve(args: argparse.Namespace) -> int:
 
     from node.config import load_config
     from node.daemon import run_node
-    from node.log import set_level, start_log
+    from node.log import set_log, start_log
 
     start_log()
     faulthandler.enable()  # a watchdog ends us with SIGABRT: then the journal says where every thread was
@@ -71,10 +72,11 @@ def run_serve(args: argparse.Namespace) -> int:
         "capture.scanner": args.scanner,
         "capture.baud": args.baud,
         "discovery.name": args.name,
+        "log.format": args.log,
     }
     reread = partial(load_config, args.config, overrides)
     config = reread()
-    set_level(config.log.level)
+    set_log(config.log.level, config.log.format)
     if args.check:
         print(json.dumps({"sound": True}) if args.json else "the settings are sound")
         return 0

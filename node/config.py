@@ -166,6 +166,7 @@ class Log(Struct, frozen=True, forbid_unknown_fields=True):
     """[log]: what goes to standard error."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"  # and what is worse
+    format: Literal["auto", "text", "json"] = "auto"  # auto: with priorities where it goes to systemd's journal
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):

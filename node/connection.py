@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import time
 from collections import deque
 from collections.abc import AsyncIterator
@@ -42,6 +43,7 @@ ACK_S = 60.0
 CLOSE_S = 2.0
 QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
 CLOSE_REASON_MAX = 120  # of 123 bytes
+QUOTED = re.compile("""['"].*['"]""", re.DOTALL)  # what a client said is told to it alone: it may be about a patient
 
 
 class _TooMany(RemoteWireError):
@@ -379,7 +381,7 @@ class Connection:
         return m.Updated(look.request, next_seq, "superseded")
 
     async def _turn_away(self, why: str, code: WSCloseCode) -> None:
-        log.warning("stream ended: %s", why)
+        log.warning("stream ended: %s", QUOTED.sub("...", why))
         if not self._socket.closed:
             with suppress(TimeoutError):  # one that does not read either
                 async with asyncio.timeout(CLOSE_S):

@@ -25,7 +25,7 @@ from node.exhibits import Exhibits
 from node.identity import node_identity
 from node.library import About, Library, Scan
 from node.live import Live
-from node.log import set_level
+from node.log import set_log
 from node.notify import Beating, Notifier, keep_notified, status_text
 from node.reload import compare
 from node.resume import publish_complete
@@ -54,7 +54,7 @@ class Node:
         change = compare(self.config, wanted)
         self.server.use(change.config)
         self.config = change.config
-        set_level(change.config.log.level)
+        set_log(change.config.log.level, change.config.log.format)
         if self.capture is not None:
             self.capture.sweep_like(sweep_request(change.config))
         return str(change)

@@ -14,7 +14,7 @@ LIVE = frozenset({
     "server.certificate", "server.key", "server.max_clients",
     "planner.cold_start_bytes_s",
     "retention.max_age_days", "retention.max_gb",
-    "log.level",
+    "log.level", "log.format",
 })  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import secrets
 import socket
 import time
 from dataclasses import asdict
@@ -375,8 +376,10 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
     except Exception as error:
         if isinstance(error, ConnectionError) or ANSWERED in request:
             raise  # nobody is there to be told, or half an answer is on its way
-        log.error("%s %s: %s: %s", request.method, request.path, type(error).__name__, error)
-        return _refusal(500, "internal server error", "the node has failed at this: its log says how")
+        incident = secrets.token_hex(4)
+        where = f"{request.method} {place_of(request)}"
+        log.error("incident %s: %s: %s: %s", incident, where, type(error).__name__, error)
+        return _refusal(500, "internal server error", f"the node has failed at this: its log says how, at {incident}")
 
 
 def _refusal(status: int, code: str, message: str) -> web.Response:

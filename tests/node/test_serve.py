@@ -103,10 +103,10 @@ async def test_a_bug_is_a_line_in_the_log_and_tells_a_client_nothing_of_the_insi
     monkeypatch.setattr(library, "scans", fail)
     async with served(library) as (node, _):
         status, said = await ask(node, "/v1/scans")
-    message = "the node has failed at this: its log says how"
-    assert (status, said) == (500, {"code": "internal server error", "message": message})
+    message, _, incident = said["message"].rpartition(" ")
+    assert (status, message) == (500, "the node has failed at this: its log says how, at")
     (record,) = caplog.records
-    assert record.getMessage() == "GET /v1/scans: KeyError: 'secret'" and record.exc_info is None
+    assert record.getMessage() == f"incident {incident}: GET /v1/scans: KeyError: 'secret'" and record.exc_info is None
 
 
 async def test_a_scan_says_when_it_was_made(tmp_path: Path) -> None:
