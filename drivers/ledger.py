@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -68,7 +67,7 @@ class Ledger:
         track.held[piece] = 1
         track.newest = max(track.newest, column.column)
         self.held += 1
-        self.digest = (self.digest + zlib.crc32(column.to_bytes())) % 2**32
+        self.digest = (self.digest + column.checksum) % 2**32
         return True
 
     def missing(self) -> tuple[ColumnRun, ...]:

@@ -57,7 +57,7 @@ from protocol.scanner_messages import (
     TextureColumn,
 )
 
-_READ_BYTES = 65536
+_READ_BYTES = 262_144
 _LOOK_UP_S = 0.1  # how long a wait for bytes may keep us from the stop flag
 
 __all__ = [

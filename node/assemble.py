@@ -280,6 +280,7 @@ class _Columns(Generic[Samples]):
         self._channel = channel
         self.width = width
         self._slots: Samples = slots
+        self._bytes = slots.reshape(-1).data.cast("B")
         self._tolerance = tolerance
         self._blend: Callable[[Samples, Samples, WeightArray], Samples] = blend
         self._slot_of: dict[int, int] = {}
@@ -297,8 +298,14 @@ class _Columns(Generic[Samples]):
         if slot == len(self._slots):
             self._grow()
         self._slot_of[tick] = slot
-        self._slots[slot, row0 : row0 + samples.shape[0]] = samples
+        self._copy(slot, row0, samples)
         self._rows[slot] |= ((1 << samples.shape[0]) - 1) << row0
+
+    def _copy(self, slot: int, row0: int, samples: Samples) -> None:
+        """Put samples into their slot; numpy would let other threads in, and wait for them (protocol.checksum)."""
+        data = np.ascontiguousarray(samples).data.cast("B")
+        begin = slot * self._slots.strides[0] + row0 * self._slots.strides[1]
+        self._bytes[begin : begin + len(data)] = data
 
     def _grow(self) -> None:
         """Make room for twice as many columns."""
@@ -308,6 +315,7 @@ class _Columns(Generic[Samples]):
         larger[: len(self._slots)] = self._slots
         self._rows += [0] * len(self._slots)
         self._slots = larger
+        self._bytes = larger.reshape(-1).data.cast("B")
 
     def _complete(self) -> tuple[IntArray, IntArray]:
         """Ticks of the columns that are whole, and their slots. (n,) each"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from collections import OrderedDict
@@ -13,11 +14,13 @@ from typing import Literal, TypeVar, overload
 from node.classic import ClassicView, build_classic_view
 from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.library import Library, Scan
+from node.right_of_way import RightOfWay
 from node.texture_model import TextureModel
 from protocol.errors import LibraryError
 from protocol.messages import CodecName, Profile
 
 VIEWS_MAX = 8
+GIVES_WAY = 10  # niceness of threads that compute for clients: a scanner does not wait
 MODELS_MAX = 8
 T = TypeVar("T")
 Work = Literal["look", "fovea", "view", "other"]
@@ -26,19 +29,25 @@ Opening = tuple[Scan, FirstView | ClassicView]
 
 
 class Exhibits:
-    """Opened scans with their first views. For one event loop; `work` runs in a few threads of its own."""
+    """Opened scans with their first views. For one event loop; `work` runs in a few threads of its own.
 
-    def __init__(self, library: Library, first_view_bytes: int, workers: int) -> None:
+    way : what these threads give way to.
+    """
+
+    def __init__(
+        self, library: Library, first_view_bytes: int, workers: int, way: RightOfWay | None = None
+    ) -> None:
         self.library = library
+        self._way = way or RightOfWay()
         self._first_view_bytes = first_view_bytes
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="encode")
+        self._pool = ThreadPoolExecutor(workers, "encode", _give_way)
         self._workers = workers
         self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0
         self._moved_s = 0.0
         self._views: OrderedDict[Key, asyncio.Future[Opening]] = OrderedDict()
         self._closing = threading.Event()
-        self._surveyor = ThreadPoolExecutor(1, thread_name_prefix="survey")
+        self._surveyor = ThreadPoolExecutor(1, "survey", _give_way)
         self._models: OrderedDict[str, Future[TextureModel]] = OrderedDict()
 
     @overload
@@ -92,8 +101,9 @@ class Exhibits:
 
         def timed() -> T:
             nonlocal begun_s
-            begun_s = time.monotonic()
-            return job()
+            with self._way.given():
+                begun_s = time.monotonic()
+                return job()
 
         if not self._working:
             self._moved_s = asked_s
@@ -130,10 +140,19 @@ class Exhibits:
         self._models.move_to_end(scan.id)
 
     def _model(self, scan: Scan, view: FirstView) -> TextureModel:
-        return TextureModel(scan.texture, texture_as_seen(view), self._closing.is_set)
+        def is_over() -> bool:
+            with self._way.given():
+                return self._closing.is_set()
+
+        return TextureModel(scan.texture, texture_as_seen(view), is_over)
 
     def _build(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening:
         scan = self.library.open(scan_id)
         if profile == "classic":
             return scan, build_classic_view(scan, codec)
         return scan, build_first_view(scan, codec, self._first_view_bytes)
+
+
+def _give_way() -> None:
+    """Have the thread that calls this run where others need not."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVES_WAY)

@@ -18,7 +18,6 @@ import os
 import re
 import secrets
 import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ from drivers.ledger import Ledger
 from node.background_writer import BackgroundWriter
 from node.durable import NEW, disk_error, require_room, sync_folder, write_whole
 from node.scan_folder import Problem
+from protocol.checksum import crc32
 from protocol.errors import LibraryError, RemoteWireError
 from protocol.scanner_messages import (
     COLUMN_OVERHEAD,
@@ -355,7 +355,7 @@ def _record_at(data: bytes | mmap.mmap, at: int) -> memoryview | None:
 
 
 def _checksum(payload: bytes | memoryview) -> int:
-    return zlib.crc32(payload, len(payload))
+    return crc32(payload, len(payload))
 
 
 def _entries(payload: memoryview) -> Iterator[tuple[int, memoryview]]:

@@ -18,6 +18,7 @@ SPIKE_ROWS = 3.0  # a spike stands out by more than this many rows' height
 SPIKE_SIGMAS = 8.0
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _UNREACHED = int(np.iinfo(np.uint16).max)
+_BAND_ROWS = 64
 _NEIGHBOURS_MIN = 5  # fewer, and it is the edge of something
 _OFFSETS = np.argwhere(_RING).T - 1
 _NEAR = [(r, c) for r in range(-2, 3) for c in range(-2, 3) if (r, c) != (0, 0)]
@@ -63,18 +64,25 @@ def undone(grid: Grid) -> Grid:
 
 def spikes_in(steps: StepArray, tall_steps: float) -> BoolArray:
     """(H, W) measured cells higher or lower than all measured neighbours by more than `tall_steps`; at least five."""
-    padded = cv2.copyMakeBorder(steps, 0, 0, 1, 1, cv2.BORDER_WRAP)
-    highest = cv2.dilate(padded, _RING, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    above = cv2.subtract(padded, highest)  # stops at 0
-    padded[padded == VOID] = _UNREACHED
-    lowest = cv2.erode(padded, _RING, borderType=cv2.BORDER_CONSTANT, borderValue=_UNREACHED)
-    below = cv2.subtract(lowest, padded)
-    far = np.maximum(above, below)[:, 1:-1] > tall_steps
-    far[steps == VOID] = False
+    padded: StepArray = np.pad(steps, 1, "wrap")
+    padded[0] = padded[-1] = VOID
+    far = np.empty(steps.shape, np.bool_)
+    for row in range(0, len(steps), _BAND_ROWS):  # a band stays in the cache while it is looked at
+        far[row : row + _BAND_ROWS] = _stands_out(padded[row : row + _BAND_ROWS + 2], tall_steps)
     cells = np.argwhere(far)
     enough = _measured_round(steps, cells) >= _NEIGHBOURS_MIN
     far[tuple(cells[~enough].T)] = False
     return far
+
+
+def _stands_out(padded: StepArray, tall_steps: float) -> BoolArray:
+    """(h, w) measured cells beyond all measured neighbours. padded : (h + 2, w + 2), a neighbour more on each side."""
+    highest = cv2.dilate(padded, _RING)
+    above = cv2.subtract(padded, highest)  # stops at 0
+    lowest = cv2.erode(np.where(padded == VOID, np.uint16(_UNREACHED), padded), _RING)
+    below = cv2.subtract(lowest, padded)
+    far = (np.maximum(above, below) > tall_steps) & (padded != VOID)
+    return np.asarray(far[1:-1, 1:-1])
 
 
 def _measured_round(steps: StepArray, cells: IntArray) -> IntArray:

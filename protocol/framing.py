@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import binascii
 import struct
-import zlib
 from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 from typing import NamedTuple
 
+from protocol.checksum import crc32
 from protocol.errors import LocalWireError
 
 MAGIC = b"\xf5\xca"
@@ -88,7 +88,7 @@ def encode_frame(
     except struct.error as error:
         raise LocalWireError(f"frame header: {error}") from error
     body = b"".join((head, binascii.crc_hqx(head, _CRC16_START).to_bytes(2, "little"), payload))
-    return body + _TRAILER.pack(zlib.crc32(body))
+    return body + _TRAILER.pack(crc32(body))
 
 
 class FrameReader:
@@ -153,7 +153,7 @@ class FrameReader:
         start, end = at + _HEADER.size, at + _HEADER.size + length
         if len(self._data) < end + _TRAILER.size:
             return None
-        if zlib.crc32(self._view[at:end]) != _TRAILER.unpack_from(self._data, end)[0]:
+        if crc32(self._view[at:end]) != _TRAILER.unpack_from(self._data, end)[0]:
             return DropReason.PAYLOAD
         return Frame(type_, self._view[start:end], seq, session, flags, version)
 

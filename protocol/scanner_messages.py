@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from protocol.checksum import crc32
 from protocol.errors import LocalWireError, RemoteWireError
 from protocol.framing import SERIAL_PAYLOAD_MAX
 from protocol.grid import FloatArray, GridSpec, ImageArray, IntArray, StepArray
@@ -426,6 +427,11 @@ class RangeColumn:
         """Number of samples."""
         return len(self.data) // self.SAMPLE_BYTES
 
+    @property
+    def checksum(self) -> int:
+        """CRC-32 of its payload, as SWEEP_END adds it up."""
+        return crc32(self.data, crc32(_column_name(self)))
+
     def to_bytes(self) -> bytes:
         """As the table RANGE_COLUMN."""
         return _column_to_bytes(self)
@@ -460,6 +466,11 @@ class TextureColumn:
     def rows(self) -> int:
         """Number of texels."""
         return len(self.data) // self.SAMPLE_BYTES
+
+    @property
+    def checksum(self) -> int:
+        """CRC-32 of its payload, as SWEEP_END adds it up."""
+        return crc32(self.data, crc32(_column_name(self)))
 
     def to_bytes(self) -> bytes:
         """As the table TEXTURE_COLUMN."""
@@ -598,8 +609,13 @@ def _text_from_bytes(payload: Payload, at: int) -> tuple[str, int]:
 
 
 def _column_to_bytes(column: Column) -> bytes:
+    return _column_name(column) + column.data
+
+
+def _column_name(column: Column) -> bytes:
+    """What stands before the samples."""
     name = (column.time_us, column.encoder, column.sweep, column.column, column.row0, column.pass_index)
-    return _COLUMN.pack(*name) + column.data
+    return _COLUMN.pack(*name)
 
 
 def _column_fields(payload: Payload, sample_bytes: int) -> tuple[int, int, int, int, int, int, Payload]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections import deque
 from collections.abc import Iterator
 
@@ -72,7 +71,7 @@ class Sweep:
         piece = self._pieces.popleft()
         if self._is_first_time:
             self._count += 1
-            self._digest = (self._digest + zlib.crc32(piece.to_bytes())) % 2**32
+            self._digest = (self._digest + piece.checksum) % 2**32
         return piece
 
     def expose(self, dt_s: float) -> None:

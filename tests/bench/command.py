@@ -35,7 +35,7 @@ def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:
     """The scans asked for that are there, and why others are not. Raises ConfigError where none is."""
     from tests.bench.scans import STANDARD, Skipped, load
 
-    specimens = tuple(args.specimen or (("head",) if args.name in ("line", "page") else STANDARD))
+    specimens = tuple(args.specimen or (("head",) if args.name in ("line", "capture", "page") else STANDARD))
     if args.texture and len(specimens) != 1:
         raise ConfigError("bench: --texture goes with one --specimen FILE")
     scans, skipped = [], []
@@ -109,8 +109,16 @@ def _page(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     return record, page.told(record)
 
 
+def _capture(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import capture
+
+    record = capture.run(args.repeats)
+    return record, capture.told(record)
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, list[BenchScan]], Told]] = {
     "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate, "alpha": _alpha, "page": _page,
+    "capture": _capture,
 }  # fmt: skip
 
 

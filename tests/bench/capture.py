@@ -1,0 +1,286 @@
+"""`bench capture`: what a sweep costs the node, and whether looking clients cost the sweep anything.
+
+Scanner, node, clients and driver are processes of their own. USB is emulated under umockdev's preload, whose work
+counts as the node's. Durations are the scanner's own: from the first column to the last. Compared are sweeps of one
+run, taken in turn; a figure is a median.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import IO, Any
+
+from foveascan import started
+from protocol.errors import ConfigError
+from tests.bench.timing import MEGABYTE
+
+SERIAL_BYTES_S, USB_BYTES_S = 300_000, 35_000_000
+CLIENTS = 16
+WORKER = [sys.executable, "-m", "tests.bench.capture_worker"]
+ROOT = Path(__file__).parents[2]
+DRIVER_BYTES = 256_000_000
+AWAY_S = 0.6
+PASSES = 4  # of M over USB: long enough to be measured
+POLL_S = 0.1
+SETTLED_S = 1.0
+
+
+@dataclass
+class Line:
+    """A scanner and a node that run: what the scanner says of its sweeps, and what the node is known by."""
+
+    url: str
+    pid: int
+    said: IO[str]
+    sweeps: list[dict[str, Any]] = field(default_factory=list)
+
+
+def run(repeats: int) -> dict[str, Any]:
+    """Everything. Raises ConfigError where USB cannot be emulated."""
+    from simulators.usb_testbed import PRELOAD, is_available
+
+    if not is_available():
+        raise ConfigError(f"bench: no {PRELOAD} here: apt-get install umockdev libusb-1.0-0")
+    return {
+        "repeats": repeats,
+        "clients": CLIENTS,
+        "serial": sweeps("pty", "S", SERIAL_BYTES_S, 1, repeats),
+        "usb": sweeps("usb", "M", USB_BYTES_S, PASSES, repeats),
+        "driver": {str(portion): driver(portion, repeats) for portion in (1 << 16, 1 << 18)},
+        "recovery_s": recovery(repeats),
+        "assembly": assembly(repeats),
+    }
+
+
+def sweeps(link: str, size: str, rate_bytes_s: float, passes: int, repeats: int) -> dict[str, Any]:
+    """Sweeps at the full speed of a link, by turns alone and while clients look as fast as they can."""
+    with line(link, size, rate_bytes_s, passes) as running:
+        sweep(running)  # the first scan, for the clients to look at; unmeasured
+        alone, beside, updates = [], [], 0
+        for _ in range(repeats):
+            alone.append(sweep(running))
+            with looking(running.url) as told:
+                beside.append(sweep(running))
+            updates += told[-1]["updates"]
+    return {
+        "size": size, "bytes": alone[0]["bytes"], "rate_aimed_at": rate_bytes_s, "updates": updates,
+        "alone": _medians(alone), "beside_clients": _medians(beside),
+        "slower": median(sweep["seconds"] for sweep in beside) / median(sweep["seconds"] for sweep in alone) - 1,
+        "lost_columns": sum(sweep["lost_columns"] for sweep in alone + beside),
+    }  # fmt: skip
+
+
+def sweep(running: Line) -> dict[str, Any]:
+    """One sweep: what the scanner said of it, and what the node took for it."""
+    cpu, lost = asyncio.run(_sweep(running))
+    said = json.loads(running.said.readline())
+    return {**said, "mb_s": said["bytes"] / MEGABYTE / said["seconds"], "core": cpu, "lost_columns": lost}
+
+
+async def _sweep(running: Line) -> tuple[float, int]:
+    """The node's share of a core while columns came, and how many it had to ask for again."""
+    from client import connect
+
+    async with connect(running.url) as session:
+        published = session.published()
+        while (await session.scanner())["phase"] != "ready":
+            await asyncio.sleep(POLL_S)
+        await session.start_sweep()
+        first = last = (time.monotonic(), _cpu_s(running.pid))
+        while (status := await session.scanner())["phase"] in ("starting", "sweeping"):
+            if status["progress"] == 0:
+                first = (time.monotonic(), _cpu_s(running.pid))
+            elif status["progress"] < 1:
+                last = (time.monotonic(), _cpu_s(running.pid))
+            await asyncio.sleep(POLL_S)
+        quality = await session.quality(await anext(published))
+    assert quality is not None
+    return (last[1] - first[1]) / max(last[0] - first[0], 1e-9), quality.requested_columns
+
+
+def driver(portion_bytes: int, repeats: int) -> dict[str, float]:
+    """The USB driver alone on the real libusb, as fast as the emulation gives: MB/s, and its share of a core."""
+    from simulators.usb_testbed import UsbTestbed
+
+    data = bytes(portion_bytes)
+    rates, shares = [], []
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory(prefix="fs-") as folder, closing(UsbTestbed(Path(folder))) as bed:
+            with worker("read", bed.name, str(DRIVER_BYTES), environment=bed.environment) as said:
+                bed.read(1 << 16, 30)
+                sending = threading.Thread(target=_flood, args=(bed, data))
+                sending.start()
+                told = json.loads(said.readline())
+                sending.join()
+        rates.append(DRIVER_BYTES / MEGABYTE / told["seconds"])
+        shares.append(told["cpu_s"] / told["seconds"])
+    return {"mb_s": median(rates), "core": median(shares)}
+
+
+def _flood(bed: Any, data: bytes) -> None:
+    for _ in range(DRIVER_BYTES // len(data) + 2):
+        bed.write(data)
+
+
+def recovery(repeats: int) -> float:
+    """From the plug's coming back to the first column that is sent again. [s]"""
+    from protocol.framing import USB_PAYLOAD_MAX
+    from protocol.scanner_messages import RangeColumn, TextureColumn
+    from simulators.carriers import serve
+    from simulators.faults import FaultyScanner, parse_faults, split_frames
+    from simulators.scanner import SimulatedScanner
+    from simulators.specimen import make_specimen
+    from simulators.turntable import Turntable
+    from simulators.usb_testbed import UsbTestbed
+
+    class Noting(UsbTestbed):
+        plugged_s: float | None = None
+
+        def plug_in(self) -> None:
+            super().plug_in()
+            self.plugged_s = time.monotonic()
+
+    class Returning(FaultyScanner):
+        columns_s: float | None = None
+
+        def data_to_send(self, max_bytes: int) -> bytes:
+            data = super().data_to_send(max_bytes)
+            is_back = bed.plugged_s is not None and bed.plugged_s > began_s
+            if is_back and self.columns_s is None and any(frame[3] in COLUMNS for frame in split_frames(data)):
+                self.columns_s = time.monotonic()
+            return data
+
+    COLUMNS = (RangeColumn.TYPE, TextureColumn.TYPE)
+    specimen, took = make_specimen("head", "S"), []
+    for seed in range(repeats):
+        faults = parse_faults(f"unplug={AWAY_S}")[0]
+        with tempfile.TemporaryDirectory(prefix="fs-") as folder, ExitStack() as stack:
+            began_s = float("inf")
+            bed = stack.enter_context(closing(Noting(Path(folder, "usb"), rate_bytes_s=1e6)))
+            scanner = Returning(
+                lambda boot: SimulatedScanner(Turntable(specimen), boot_id=boot, payload_max=USB_PAYLOAD_MAX),
+                faults,
+                seed,
+            )
+            stop = threading.Event()
+            thread = threading.Thread(target=serve, args=(scanner, bed, stop))
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(bed.cancel)
+            stack.callback(stop.set)
+            _, ready = stack.enter_context(_node(folder, bed.name, bed.environment, 1))
+            began_s = time.monotonic()
+            asyncio.run(_published(ready["url"]))
+        assert scanner.columns_s is not None and bed.plugged_s is not None
+        took.append(scanner.columns_s - bed.plugged_s)
+    return median(took)
+
+
+async def _published(url: str) -> None:
+    from client import connect
+
+    async with connect(url) as session:
+        published = session.published()
+        while (await session.scanner())["phase"] != "ready":
+            await asyncio.sleep(POLL_S)
+        await session.start_sweep()
+        await anext(published)
+
+
+def assembly(repeats: int) -> dict[str, float]:
+    """A grid of L, its quality and repairs, after its last column: seconds, and memory as a multiple of its arrays."""
+    told = []
+    for _ in range(repeats):
+        with worker("assemble") as said:
+            told.append(json.loads(said.readline()))
+    return {
+        "seconds": median(one["seconds"] for one in told),
+        "times_arrays": median(one["peak_bytes"] / one["arrays_bytes"] for one in told),
+    }
+
+
+@contextmanager
+def line(link: str, size: str, rate_bytes_s: float, passes: int) -> Iterator[Line]:
+    """A scanner whose table waits for nothing but its line, and a node."""
+    with tempfile.TemporaryDirectory(prefix="fs-") as folder, ExitStack() as stack:
+        arguments = (link, f"{folder}/usb" if link == "usb" else f"{folder}/tty", size, str(rate_bytes_s), "0.05")
+        said = stack.enter_context(worker("device", *arguments))
+        scanner = json.loads(said.readline())
+        process, ready = stack.enter_context(_node(folder, scanner["address"], scanner["environment"], passes))
+        yield Line(ready["url"], process.pid, said)
+
+
+@contextmanager
+def looking(url: str) -> Iterator[list[dict[str, Any]]]:
+    """Clients at work; when they are stopped, what they did is the last in the list."""
+    told: list[dict[str, Any]] = []
+    with worker("look", url, str(CLIENTS)) as said:
+        told.append(json.loads(said.readline()))
+        time.sleep(SETTLED_S)
+        yield told
+    told.append(json.loads(said.readline()))
+
+
+@contextmanager
+def worker(*arguments: str, environment: dict[str, str] | None = None) -> Iterator[IO[str]]:
+    """A process of tests/bench/capture_worker.py; its output, which can be read to its end after it was ended."""
+    process = subprocess.Popen(
+        [*WORKER, *arguments], stdout=subprocess.PIPE, text=True, cwd=ROOT, env={**os.environ, **(environment or {})}
+    )
+    assert process.stdout is not None
+    try:
+        yield process.stdout
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+def _node(folder: str, scanner: str, environment: dict[str, str], passes: int) -> Any:
+    config = Path(folder, "node.toml")
+    config.write_text(f"[capture]\npasses = {passes}\n[discovery]\nenabled = false\n")
+    serve = ["serve", "--config", str(config), "--scanner", scanner, "--library", f"{folder}/library"]
+    return started(*serve, "--listen", "127.0.0.1:0", "--insecure", "--json", environment=environment)
+
+
+def _cpu_s(pid: int) -> float:
+    """CPU that a process has had, all threads together. [s]"""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _medians(swept: list[dict[str, Any]]) -> dict[str, float]:
+    return {name: median(one[name] for one in swept) for name in ("seconds", "mb_s", "core")}
+
+
+def told(record: dict[str, Any]) -> str:
+    """The figures as text."""
+    lines = [f"medians of {record['repeats']}; {record['clients']} clients looking as fast as they can"]
+    for name in ("serial", "usb"):
+        found = record[name]
+        alone, beside = found["alone"], found["beside_clients"]
+        lines.append(
+            f"{name}, {found['size']}: {alone['mb_s']:.2f} MB/s of {found['rate_aimed_at'] / MEGABYTE:.2f} at"
+            f" {100 * alone['core']:.1f} % of a core; beside clients {beside['mb_s']:.2f} MB/s,"
+            f" {100 * found['slower']:+.1f} % in time ({found['updates']} updates);"
+            f" {found['lost_columns']} columns lost"
+        )
+    for portion, found in record["driver"].items():
+        share = f"{100 * found['core']:.0f} % of a core"
+        lines.append(f"USB driver alone, writes of {portion} bytes: {found['mb_s']:.0f} MB/s, {share}")
+    lines.append(f"first column after the plug is back: {record['recovery_s']:.2f} s")
+    grid = record["assembly"]
+    memory = f"{grid['times_arrays']:.2f} times its arrays"
+    lines.append(f"a grid of L after its last column: {grid['seconds']:.2f} s, {memory}")
+    return "\n".join(lines)

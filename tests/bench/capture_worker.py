@@ -1,0 +1,170 @@
+"""What `bench capture` runs in processes of their own, so that each one's time and memory can be told from the others'.
+
+    device LINK PATH SIZE BYTES_S TURN_S    a simulated scanner; prints a line for each sweep: seconds, columns' bytes
+    look URL CLIENTS                        clients that look as fast as they can, until SIGTERM; prints their updates
+    read ADDRESS BYTES                      the USB driver alone, under umockdev's preload; prints seconds and CPU
+    assemble                                a grid of L from its columns; prints seconds and memory
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+NICE = 19  # clients stand for other machines: they may have what is left of this one
+
+
+def say(**record: Any) -> None:
+    """One line for whoever started this."""
+    print(json.dumps(record), flush=True)
+
+
+def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str) -> None:
+    """A scanner that says how long each of its sweeps took."""
+    from protocol.framing import SERIAL_PAYLOAD_MAX, USB_PAYLOAD_MAX
+    from protocol.scanner_messages import State
+    from simulators.carriers import PORTION_BYTES, PtyPort, serve
+    from simulators.command import BITS_PER_BYTE, USB_PORTION_BYTES
+    from simulators.scanner import SimulatedScanner
+    from simulators.specimen import make_specimen
+    from simulators.turntable import Turntable
+    from simulators.usb_testbed import UsbTestbed
+
+    class Timed(SimulatedScanner):
+        _began: tuple[float, int] | None = None
+
+        def data_to_send(self, max_bytes: int) -> bytes:
+            data = super().data_to_send(max_bytes)
+            if self.state is State.SWEEPING and self._began is None:
+                self._began = time.monotonic(), self._link.sent_bytes
+            elif self.state is State.HOLDING and self._began is not None:
+                began_s, sent = self._began
+                say(seconds=time.monotonic() - began_s, bytes=self._link.sent_bytes - sent)
+                self._began = None
+            return data
+
+    is_usb = link == "usb"
+    table = Turntable(make_specimen("head", size), turn_s=float(turn_s))
+    scanner = Timed(table, payload_max=USB_PAYLOAD_MAX if is_usb else SERIAL_PAYLOAD_MAX)
+    stop = threading.Event()
+    port: UsbTestbed | PtyPort
+    if is_usb:
+        port = UsbTestbed(Path(path), rate_bytes_s=float(rate_bytes_s))
+    else:
+        port = PtyPort(Path(path), BITS_PER_BYTE * round(float(rate_bytes_s)))
+
+    def end(*_: object) -> None:
+        stop.set()
+        port.cancel()
+
+    signal.signal(signal.SIGTERM, end)
+    with closing(port):
+        environment = port.environment if isinstance(port, UsbTestbed) else {}
+        say(address=port.name, environment=environment)
+        serve(scanner, port, stop, USB_PORTION_BYTES if is_usb else PORTION_BYTES)
+
+
+def look(url: str, clients: str) -> None:
+    """Clients that are never content."""
+    os.nice(NICE)
+    updates = asyncio.run(_look(url, int(clients)))
+    say(updates=updates)
+
+
+async def _look(url: str, clients: int) -> int:
+    """Foveae over HTTP: as much work for the node as a look on a stream, and hardly any for who asks."""
+    import aiohttp
+
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    updates = 0
+
+    async def one(number: int, http: aiohttp.ClientSession, scan: str) -> None:
+        nonlocal updates
+        rng = random.Random(number)
+        while True:
+            place = {"u": f"{rng.random():.6f}", "v": f"{rng.random():.6f}"}
+            async with http.get(f"{url}/v1/scans/{scan}/fovea", params=place) as response:
+                response.raise_for_status()
+                await response.read()
+            updates += 1
+
+    async with aiohttp.ClientSession() as http:
+        async with http.get(f"{url}/v1/scans/latest") as response:
+            scan = (await response.json())["id"]
+        tasks = [asyncio.create_task(one(number, http, scan)) for number in range(clients)]
+        while not updates:
+            await asyncio.sleep(0.1)
+            for task in tasks:
+                if task.done():
+                    task.result()
+        say(looking=clients)
+        await stop.wait()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    return updates
+
+
+def read(address: str, size_bytes: str) -> None:
+    """Everything that a device sends, thrown away."""
+    from drivers.usb_port import UsbAddress, UsbPort
+
+    with closing(UsbPort(UsbAddress.parse(address))) as port:
+        port.write(b"go")
+        left, began_s, cpu_s = int(size_bytes), 0.0, 0.0
+        while left > 0:
+            data = port.read(1 << 20, 5)
+            if not began_s:
+                began_s, cpu_s, left = time.monotonic(), time.process_time(), left + len(data)  # from the first on
+            left -= len(data)
+        say(seconds=time.monotonic() - began_s, cpu_s=time.process_time() - cpu_s)
+
+
+def assemble() -> None:
+    """A sweep at L whose last column has just come; memory is what it took beyond the program itself."""
+    from exchange.formats import SIZES
+    from node.assemble import Assembler, Encoder
+    from protocol.grid import GridSpec
+
+    width, height, texture_width, texture_height = SIZES["L"]
+    spec = GridSpec(width, height, texture_width, texture_height, 0.01, 0.1)
+    Assembler(GridSpec(8, 8, 8, 8, 0.01, 0.1), Encoder(64))
+    before = _peak_bytes()
+    counts = 2 * texture_width
+    assembler = Assembler(spec, Encoder(counts))
+    wave = 200 * np.sin(np.arange(height) / 99)
+    for column in range(width):
+        shape = 5000 + wave + 300 * np.sin(2 * np.pi * column / width)
+        assembler.add_range_column(4 * column + 2, 0, shape.astype(np.uint16))
+    texels = np.random.default_rng(7).integers(0, 256, (texture_height, 3), np.uint8)
+    for column in range(texture_width):
+        assembler.add_texture_column(2 * column + 1, 0, np.roll(texels, column, axis=0))
+    began_s = time.perf_counter()
+    grid = assembler.assembly().grid
+    took_s = time.perf_counter() - began_s
+    arrays = grid.range_steps.nbytes + grid.texture.nbytes
+    say(seconds=took_s, arrays_bytes=arrays, peak_bytes=_peak_bytes() - before)
+
+
+def _peak_bytes() -> int:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+JOBS: dict[str, Callable[..., None]] = {"device": device, "look": look, "read": read, "assemble": assemble}
+
+if __name__ == "__main__":
+    JOBS[sys.argv[1]](*sys.argv[2:])
