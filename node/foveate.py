@@ -137,7 +137,7 @@ class _Planner:
         explicit = self._look.parameters
         if explicit is not None:
             if explicit.range:
-                self._take(self._code_range(explicit.range, self._range_region), settle=False)
+                self._take(self._code_range(explicit.range, self._range_region, quick=True), settle=False)
             if explicit.texture:
                 self._take(self._code_texture(explicit.texture, self._texture_region))
             return
@@ -251,9 +251,9 @@ class _Planner:
 
     # -- one refinement --------------------------------------------------------------------------------------------
 
-    def _code_range(self, wanted: RangeParameters, region: Region) -> Coded | None:
+    def _code_range(self, wanted: RangeParameters, region: Region, *, quick: bool = False) -> Coded | None:
         self._encodes.add()
-        return code_range(self._scan, self._state, region, wanted)
+        return code_range(self._scan, self._state, region, wanted, quick=quick)
 
     def _code_texture(self, wanted: TextureParameters, region: Region) -> Coded | None:
         self._encodes.add()

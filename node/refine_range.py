@@ -70,27 +70,32 @@ def trial_of(scan: Scan, state: ClientState, region: Region, p: int) -> Trial | 
     return Trial(scan, strips, region) if strips else None
 
 
-def code_range(scan: Scan, state: ClientState, region: Region, wanted: RangeParameters) -> Coded | None:
+def code_range(
+    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, *, quick: bool = False
+) -> Coded | None:
     """Encode a refinement of the region's blocks, or None when the client holds all of it already.
 
+    quick : spare time rather than bytes.
     Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
     Raises LatticeError for a spacing that does not fit the scan.
     """
-    return code_range_lattice(scan, state, range_lattice(region, wanted), wanted.quantum)
+    return code_range_lattice(scan, state, range_lattice(region, wanted), wanted.quantum, quick=quick)
 
 
-def code_range_lattice(scan: Scan, state: ClientState, parameters: Parameters, quantum: int) -> Coded | None:
+def code_range_lattice(
+    scan: Scan, state: ClientState, parameters: Parameters, quantum: int, *, quick: bool = False
+) -> Coded | None:
     """The same for a lattice that is given."""
     strips, quantum = select_range_lattice(state, parameters, quantum)
     if not strips:
         return None
-    parts = tuple(_code_strip(scan, strip, quantum) for strip in strips)
+    parts = tuple(_code_strip(scan, strip, quantum, quick) for strip in strips)
     return Coded(parts, range_rank(quantum), quantum, RangeCodec.LIFT)
 
 
-def _code_strip(scan: Scan, strip: Strip, quantum: int) -> Part:
+def _code_strip(scan: Scan, strip: Strip, quantum: int, quick: bool) -> Part:
     samples, seen = range_samples(scan, strip.selection)
-    payload, decoded = encode_and_decode(samples, quantum, seen)
+    payload, decoded = encode_and_decode(samples, quantum, seen, quick=quick)
     return Part(strip, payload, encode_mask(void_cells(scan, strip.selection)), decoded)
 
 

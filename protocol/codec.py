@@ -71,16 +71,17 @@ def decode_texture(payload: bytes, codec: TextureCodec, quality: int, shape: tup
 
 
 def encode_range(
-    range_steps: StepArray, codec: RangeCodec, quantum: int = 1, care: BoolArray | None = None
+    range_steps: StepArray, codec: RangeCodec, quantum: int = 1, care: BoolArray | None = None, *, quick: bool = False
 ) -> bytes:
     """Payload of (h, w) uint16 steps without voids, each to within quantum // 2 steps; exact at quantum 1.
 
     care : (h, w) bool, False where any value will do (LIFT spends nothing there).
+    quick : a tenth of the time and 4 to 8% more bytes for LIFT; nothing else differs.
     Raises CodecError for an array that is not that.
     """
     _check_array(range_steps, np.uint16, 1)
     if codec == RangeCodec.LIFT:
-        return codec_lift.encode(range_steps, quantum, care)
+        return codec_lift.encode(range_steps, quantum, care, quick=quick)
     values = quantise(range_steps, quantum)
     return values.astype("<u2").tobytes() if codec == RangeCodec.RAW else codec_htj2k.encode(values, LOSSLESS)
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import zlib
 
+import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,28 +23,29 @@ from protocol.grid import STEPS_MAX, BoolArray, StepArray
 QUANTUM_MAX = 65534
 _ESCAPE = 3
 _BYTE = 255
-_DEFLATE_LEVEL = 6
+_QUICK, _THOROUGH = 6, 12  # levels of libdeflate
 _WORD_MAX = 4 * STEPS_MAX
 _RUN_MIN, _RUN_MAX = 4, 258  # equal bytes that deflate makes one code of
-_EXPERIENCE = 0.97, 4.2, 5.5, 77.0  # bits a bit of entropy, a run, a symbol used, a stream
+_EXPERIENCE = 0.93, 1.2, 6.3, 82.0  # bits a bit of entropy, a run, a symbol used, a stream
 
 Int32Array = NDArray[np.int32]
 
 
-def encode(range_steps: StepArray, quantum: int, care: BoolArray | None = None) -> bytes:
+def encode(range_steps: StepArray, quantum: int, care: BoolArray | None = None, *, quick: bool = False) -> bytes:
     """Payload of (h, w) uint16 steps, each within quantum // 2 of what `decode` returns; exact at quantum 1.
 
-    care : (h, w) bool, False where any value will do.
+    care : (h, w) bool, False where any value will do.   quick : a tenth of the time and 4 to 8% more bytes.
     """
-    return encode_and_decode(range_steps, quantum, care)[0]
+    return encode_and_decode(range_steps, quantum, care, quick=quick)[0]
 
 
 def encode_and_decode(
-    range_steps: StepArray, quantum: int, care: BoolArray | None = None
+    range_steps: StepArray, quantum: int, care: BoolArray | None = None, *, quick: bool = False
 ) -> tuple[bytes, StepArray]:
     """Payload as of `encode`, and what `decode` will return."""
     decoded, missed = _analysed(range_steps, quantum, care)
-    return _deflate(_pack(missed)), _clamped(decoded)
+    payload = imagecodecs.deflate_encode(_pack(missed), level=_QUICK if quick else _THOROUGH, raw=True)
+    return bytes(payload), _clamped(decoded)
 
 
 def survey(range_steps: StepArray, quantum: int, care: BoolArray | None = None) -> tuple[StepArray, float]:
@@ -75,33 +77,43 @@ def _analyse(samples: Int32Array, quantum: int, care: BoolArray | None, parts: l
         steps = (samples + quantum // 2) // quantum
         parts.append(steps.ravel())
         return steps * quantum
-    decoded = np.empty_like(samples)
-    decoded[::2, ::2] = _analyse(samples[::2, ::2], quantum, None if care is None else care[::2, ::2], parts)
-    parts.append(_code_between(samples[::2], decoded[::2], quantum, None if care is None else care[::2]).ravel())
-    parts.append(_code_between(samples.T, decoded.T, quantum, None if care is None else care.T).T.ravel())
+    rows, columns = samples.shape[0] // 2, samples.shape[1] // 2
+    known = _analyse(samples[::2, ::2], quantum, None if care is None else care[::2, ::2], parts)
+    even = np.empty((known.shape[0], samples.shape[1]), np.int32)
+    even[:, ::2] = known
+    wanted = None if care is None else care[::2, 1::2]
+    even[:, 1::2] = _code_between(samples[::2, 1::2], known[:, :columns], known[:, 1:], quantum, wanted, parts)
+    decoded = np.empty(samples.shape, np.int32)
+    decoded[::2] = even
+    wanted = None if care is None else care[1::2]
+    decoded[1::2] = _code_between(samples[1::2], even[:rows], even[1:], quantum, wanted, parts)
     return decoded
 
 
-def _code_between(samples: Int32Array, decoded: Int32Array, quantum: int, care: BoolArray | None) -> Int32Array:
-    """Misses of every second column, predicted from its neighbours; fills these columns of decoded."""
-    predicted = _predict(decoded)
-    missed = samples[:, 1::2] - predicted
+def _code_between(
+    samples: Int32Array, before: Int32Array, behind: Int32Array, quantum: int, care: BoolArray | None,
+    parts: list[Int32Array],
+) -> Int32Array:  # fmt: skip
+    """Append the misses of samples between known ones to parts. Returns them as they will be decoded."""
+    decoded = _predict(before, behind)
+    missed = samples - decoded
     if quantum > 1:
-        missed = np.sign(missed) * ((np.abs(missed) + quantum // 2) // quantum)
+        if quantum % 2 == 0:
+            missed += missed >> 31  # so that halves go away from nought on both sides
+        missed += quantum // 2
+        missed //= quantum
     if care is not None:
-        missed *= care[:, 1::2]
-    decoded[:, 1::2] = predicted + missed * quantum
-    return missed
+        missed *= care
+    decoded += missed * quantum
+    parts.append(missed.ravel())
+    return decoded
 
 
-def _predict(decoded: Int32Array) -> Int32Array:
-    """Mean of the columns left and right of each odd one, halves up; the left one alone at the edge."""
-    width = decoded.shape[1]
-    left = decoded[:, 0 : width - width % 2 : 2]
-    predicted = left.copy()
-    right = decoded[:, 2::2]
-    inner = predicted[:, : right.shape[1]]
-    inner += right[:, : inner.shape[1]]
+def _predict(before: Int32Array, behind: Int32Array) -> Int32Array:
+    """Mean of the known samples before and behind each, halves up; behind the last known one that one alone."""
+    predicted = before.copy()
+    inner = predicted[: behind.shape[0], : behind.shape[1]]
+    inner += behind[: before.shape[0], : before.shape[1]]
     inner += 1
     inner >>= 1
     return predicted
@@ -124,19 +136,21 @@ def _synthesise(values: _Reader, shape: tuple[int, int], quantum: int) -> Int32A
     height, width = shape
     if max(shape) <= 2:
         return values.take(height, width) * quantum
+    rows, columns = height // 2, width // 2
+    known = _synthesise(values, (height - rows, width - columns), quantum)
+    even = np.empty((height - rows, width), np.int32)
+    even[:, ::2] = known
+    even[:, 1::2] = _predict(known[:, :columns], known[:, 1:]) + values.take(height - rows, columns) * quantum
     decoded = np.empty(shape, np.int32)
-    decoded[::2, ::2] = _synthesise(values, (-(-height // 2), -(-width // 2)), quantum)
-    even = decoded[::2]
-    even[:, 1::2] = _predict(even) + values.take(even.shape[0], width // 2) * quantum
-    across = decoded.T
-    across[:, 1::2] = _predict(across) + values.take(height // 2, width).T * quantum
+    decoded[::2] = even
+    decoded[1::2] = _predict(even[:rows], even[1:]) + values.take(rows, width) * quantum
     return decoded
 
 
 def _expected_bytes(packed: bytes) -> float:
     """What deflate should make of packed misses: literals and runs by their entropy, codes and streams by experience.
 
-    Fitted to 1500 payloads of 8 scans (S and M, spacings 1 to 8, quanta 1 to 1024): 6% off, 3% where they are long.
+    Fitted to 1500 payloads of 8 scans (S and M, spacings 1 to 8, quanta 1 to 1024): 5% off, 3% where they are long.
     """
     data = np.frombuffer(packed, np.uint8)
     start = np.flatnonzero(np.concatenate([[True], data[1:] != data[:-1]]))
@@ -157,9 +171,11 @@ def _expected_bytes(packed: bytes) -> float:
 
 def _pack(missed: Int32Array) -> bytes:
     unsigned = (missed << 1) ^ (missed >> 31)
-    small = np.minimum(unsigned, _ESCAPE).astype(np.uint8)
-    fours = np.pad(small, (0, -small.size % 4)).reshape(-1, 4)
-    packed = fours[:, 0] | fours[:, 1] << 2 | fours[:, 2] << 4 | fours[:, 3] << 6
+    small = np.zeros(-(-missed.size // 4) * 4, np.uint8)
+    np.minimum(unsigned, _ESCAPE, out=small[: missed.size], casting="unsafe")
+    fours = small.view("<u4")
+    packed = (fours | fours >> 6 | fours >> 12 | fours >> 18).astype(np.uint8)
+    small = small[: missed.size]
     escaped = unsigned[small == _ESCAPE] - _ESCAPE
     wide = escaped[escaped >= _BYTE] - _BYTE
     escapes = np.minimum(escaped, _BYTE).astype(np.uint8)
@@ -185,11 +201,6 @@ def _unpack(data: bytes, count: int) -> Int32Array:
     escaped[wide_places] += words.astype(np.int32)
     unsigned[places] += escaped
     return (unsigned >> 1) ^ -(unsigned & 1)
-
-
-def _deflate(data: bytes) -> bytes:
-    deflater = zlib.compressobj(_DEFLATE_LEVEL, zlib.DEFLATED, -15, 9)
-    return deflater.compress(data) + deflater.flush()
 
 
 def _inflate(payload: bytes, count: int) -> bytes:

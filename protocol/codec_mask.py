@@ -51,13 +51,15 @@ def decode(payload: bytes, shape: tuple[int, int]) -> BoolArray:
 def _edge_numbers(mask: BoolArray) -> IntArray:
     edges = mask.copy()
     edges[:, 1:] ^= mask[:, :-1]
-    counts = np.count_nonzero(edges, axis=1)
-    columns = np.nonzero(edges)[1]
+    crossed = edges.any(axis=1)  # few rows in most windows, so only these are looked at closely
+    rows, columns = np.nonzero(edges[crossed])
+    counts = np.zeros(len(mask), np.int64)
+    counts[crossed] = np.bincount(rows)
     heads, firsts, moves, used = [], [], [], 0
     for top, bottom in pairwise([*np.flatnonzero(np.diff(counts, prepend=-1)), len(mask)]):
-        band = rows, count = bottom - top, counts[top]
-        paths = columns[used : used + rows * count].reshape(band)
-        used += rows * count
+        band = high, count = bottom - top, counts[top]
+        paths = columns[used : used + high * count].reshape(band)
+        used += high * count
         heads.append(band)
         firsts.append(np.diff(paths[0], prepend=0))
         moves.append(_to_unsigned(np.diff(paths, axis=0)).T.ravel())

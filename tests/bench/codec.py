@@ -103,12 +103,16 @@ def range_codecs(steps: StepArray, step_mm: float, repeats: int) -> dict[str, di
     encoders: dict[str, Callable[[], bytes]] = {
         codec.name: partial(encode_range, steps, codec, quantum) for codec in RangeCodec
     }
+    encoders["LIFT, quick"] = partial(encode_range, steps, RangeCodec.LIFT, quantum, quick=True)
     encoders["JPEG-LS"] = lambda: bytes(imagecodecs.jpegls_encode(values, out=4 * values.nbytes + 1024))
     payloads = {name: encode() for name, encode in encoders.items()}
     decoders: dict[str, Callable[[], Any]] = {
         f"decode {codec.name}": partial(decode_range, payloads[codec.name], codec, steps.shape, quantum)
         for codec in RangeCodec
     }
+    decoders["decode LIFT, quick"] = partial(
+        decode_range, payloads["LIFT, quick"], RangeCodec.LIFT, steps.shape, quantum
+    )
     decoders["decode JPEG-LS"] = lambda: imagecodecs.jpegls_decode(payloads["JPEG-LS"])
     taken_s = medians_s({**encoders, **decoders}, repeats)
     return {
