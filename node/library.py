@@ -51,12 +51,14 @@ PREFIX_MIN = 6  # as few digits of an id stand for it
 
 @dataclass(frozen=True, slots=True)
 class ScanSummary:
-    """A scan as a list shows it; its name is the one it was given last."""
+    """A scan as a list shows it; its name is the one it was given last, and so are subject and body site."""
 
     id: str
     sequence: int
     spec: GridSpec
     about: About
+    subject: str = ""
+    body_site: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -319,9 +321,8 @@ def _summary(folder: Path, record: Record) -> tuple[ScanSummary, list[Problem]]:
 
 
 def _named(summary: ScanSummary, sidecar: Sidecar) -> ScanSummary:
-    if sidecar.name is None:
-        return summary
-    return replace(summary, about=replace(summary.about, name=sidecar.name))
+    about = summary.about if sidecar.name is None else replace(summary.about, name=sidecar.name)
+    return replace(summary, about=about, subject=sidecar.subject, body_site=sidecar.body_site)
 
 
 def _derive(grid: Grid, first_view_bytes: int) -> _Derived:

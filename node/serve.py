@@ -330,7 +330,7 @@ def _summary(scan: ScanSummary) -> dict[str, object]:
     return {
         "id": scan.id, "created": scan.about.created_unix_s, "source": scan.about.source, "name": scan.about.name,
         "width": s.width, "height": s.height, "textureWidth": s.texture_width, "textureHeight": s.texture_height,
-        "geometry": s.geometry, "madeFrom": scan.about.made_from,
+        "geometry": s.geometry, "madeFrom": scan.about.made_from, "subject": scan.subject, "bodySite": scan.body_site,
     }  # fmt: skip
 
 

@@ -14,6 +14,26 @@ export interface ScanSummary {
   bodySite?: string;
 }
 
+/** How a sweep went, as far as the node can tell; lengths in mm. More of it is in PROTOCOL.md. */
+export interface Quality {
+  coverage: number;
+  holes: number;
+  passes: number;
+  noiseMm: number | null;
+  slipDeg: number | null;
+  spikes: number;
+  filled: number;
+  requestedColumns: number;
+  /** What of this a person should know, in words. */
+  complaints: string[];
+}
+
+/** Where a scan comes from. quality: null of one that was not swept here; note: how it was made, then. */
+export interface Account {
+  quality: Quality | null;
+  note: string;
+}
+
 /** What people say of a scan. */
 export interface Sidecar {
   revision: number;
@@ -32,6 +52,11 @@ export interface Capture {
   [more: string]: unknown;
 }
 
+/** What is left out of a quality stands for. */
+const UNSAID: Quality = {
+  coverage: 0, holes: 0, passes: 1, noiseMm: null, slipDeg: null, spikes: 0, filled: 0, requestedColumns: 0, complaints: [],
+};
+
 /** The node said no; the message is for people. */
 export class Refused extends Error {
   constructor(readonly status: number, message: string) {
@@ -43,6 +68,10 @@ export const listScans = (): Promise<ScanSummary[]> => ask('GET', '/v1/scans');
 export const startSweep = (): Promise<unknown> => ask('POST', '/v1/sweeps');
 export const deleteScan = (id: string): Promise<unknown> => ask('DELETE', `/v1/scans/${id}`);
 export const readCapture = async (): Promise<Capture> => (await ask<{ capture: Capture }>('GET', '/v1/node')).capture;
+export const readAccount = async (id: string): Promise<Account> => {
+  const { quality, note } = await ask<{ quality?: Partial<Quality> | null; note?: string }>('GET', `/v1/scans/${id}`);
+  return { quality: quality ? { ...UNSAID, ...quality } : null, note: note ?? '' };
+};
 export const downloadPath = (id: string, format: string): string => `/v1/scans/${id}.${format}`;
 
 /** What is said of a scan; null where the node keeps no such thing. */

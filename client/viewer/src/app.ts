@@ -1,6 +1,6 @@
 // The page: panels, picture and worker, and what passes between them.
 
-import { deleteScan, listScans, readCapture } from './api.ts';
+import { deleteScan, listScans, readAccount, readCapture } from './api.ts';
 import type { Sidecar } from './api.ts';
 import type { Answer, FromWorker, LinkState, Snapshot, ToWorker } from './link.ts';
 import type { ScanInfo } from './protocol/messages.ts';
@@ -18,6 +18,7 @@ import { Marks } from './ui/marks.ts';
 import { PinsPanel } from './ui/pins_panel.ts';
 import { ScanList } from './ui/scan_list.ts';
 import { ScannerPanel } from './ui/scanner_panel.ts';
+import { WorthPanel } from './ui/worth_panel.ts';
 import { formatState, parseState } from './url_state.ts';
 import type { Pin } from './url_state.ts';
 import type { Place } from './view/pick.ts';
@@ -36,13 +37,14 @@ export class App {
   private readonly display: DisplayPanel;
   private readonly cost = new CostPanel();
   private readonly pinsPanel: PinsPanel;
+  private readonly worth = new WorthPanel();
   private readonly about: AboutPanel;
   private readonly sweep: Sweep;
   private readonly sidecar: OpenSidecar;
 
   private state = parseState(location.hash.slice(1));
   private info: ScanInfo | null = null;
-  private role = 'view';
+  private mayChange = false;
   private looks = 0;
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
@@ -75,7 +77,7 @@ export class App {
     this.display = new DisplayPanel((shading, overlay) => this.stage.setLook(shading, overlay));
     this.frame.stage.append(this.display.legend, this.marks.element);
     this.frame.add(this.scans.element, this.scanner.element, this.look.element, this.display.element, this.pinsPanel.element,
-      this.cost.element, this.about.element);
+      this.worth.element, this.cost.element, this.about.element);
     this.listen();
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
     void this.refreshScans();
@@ -136,10 +138,19 @@ export class App {
   private linked(link: LinkState): void {
     this.frame.linked(link);
     if (link.state !== 'ready') return;
-    this.role = link.role;
-    this.scanner.allow(link.role);
+    this.allow(link.role !== 'view');
     void this.refreshScans();
     void this.refreshCapture();
+  }
+
+  /** Show what who looks may do, and nothing that the node would refuse. */
+  private allow(mayChange: boolean): void {
+    this.mayChange = mayChange;
+    this.frame.allow(mayChange);
+    this.scanner.allow(mayChange);
+    this.look.allowPins(mayChange);
+    this.pinsPanel.allow(mayChange);
+    this.showPins();
   }
 
   private opened(snapshot: Snapshot, fresh: boolean): void {
@@ -161,6 +172,7 @@ export class App {
     this.about.show(snapshot.info);
     if (framed) this.restoreState(snapshot.info.id);
     void this.sidecar.open(snapshot.info.id);
+    void this.readWorth(snapshot.info.id);
   }
 
   /** What the address asks for, when it is about this scan; else a clean view of it. */
@@ -324,7 +336,7 @@ export class App {
   }
 
   private takeSidecar(scan: string, sidecar: Sidecar | null): void {
-    this.about.said(sidecar, this.role);
+    this.about.said(sidecar, this.mayChange);
     if (sidecar) {
       this.scans.said(scan, sidecar);
       this.state.pins = sidecar.pins;
@@ -351,11 +363,17 @@ export class App {
     this.sidecar.close();
     this.stage.clear();
     this.about.hide();
+    this.worth.hide();
     this.marks.setPins([]);
     this.setMeasured([]);
     this.state = { scan: null, camera: null, foveae: [], pins: [] };
     await this.refreshScans();
     this.tell({ kind: 'open', scan: 'latest' });
+  }
+
+  private async readWorth(scan: string): Promise<void> {
+    const account = await readAccount(scan).catch(() => null);
+    if (this.info?.id === scan) this.worth.show(account);
   }
 
   private async refreshScans(): Promise<void> {

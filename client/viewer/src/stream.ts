@@ -38,6 +38,9 @@ export class Stream {
   private model: Model | null = null;
   /** The scan that the page wants to see. */
   private wanted: string | null = null;
+  /** Messages that have come and are not taken yet, and patches that the page shall get with what they bring. */
+  private waiting = 0;
+  private patches: Extract<FromWorker, { kind: 'patch' }>[] = [];
   private request = 0;
   private opening = 0;
   private looking: Looking | null = null;
@@ -62,7 +65,8 @@ export class Stream {
     socket.binaryType = 'arraybuffer';
     socket.onmessage = ({ data }: MessageEvent<string | ArrayBuffer>) => {
       this.count(data);
-      this.work = this.work.then(() => this.take(socket, data)).catch((error: unknown) => this.fail(socket, error));
+      this.waiting++;
+      this.work = this.work.then(() => this.take(socket, data)).catch((error: unknown) => this.fail(socket, error)).then(() => this.taken());
     };
     socket.onclose = ({ reason }) => void this.lost(socket, reason);
   }
@@ -187,7 +191,16 @@ export class Stream {
     }
     const { channel } = refinement;
     const level = model.holdings.channels[channel].level.slice();
-    this.tell({ kind: 'patch', channel, changed, level }, changed.map(({ cells }) => cells.buffer as ArrayBuffer));
+    this.patches.push({ kind: 'patch', channel, changed, level });
+  }
+
+  /** A message is done with. What belongs together and has come together is drawn at once, not one after the other. */
+  private taken(): void {
+    if (--this.waiting === 0) this.tellPatches();
+  }
+
+  private tellPatches(): void {
+    for (const patch of this.patches.splice(0)) this.tell(patch, patch.changed.map(({ cells }) => cells.buffer as ArrayBuffer));
   }
 
   private firstView(model: Model): void {
@@ -240,6 +253,7 @@ export class Stream {
   private answer({ look, began, bytes, applyMs }: Looking, reason: Answer['reason'], said: Updated | null): void {
     const [errorMaxMm, textureDb] = [said?.errorMaxMm ?? null, said?.textureDb ?? null];
     const elapsedMs = performance.now() - began;
+    this.tellPatches();
     this.tell({ kind: 'updated', answer: { look: look.request, reason, bytes, elapsedMs, applyMs, errorMaxMm, textureDb } });
   }
 
@@ -287,6 +301,7 @@ export class Stream {
   }
 
   private tellSnapshot(model: Model, fresh: boolean): void {
+    this.patches = []; // the snapshot has them
     const [range, texture] = CHANNELS.map((channel) => model.holdings.channels[channel].level.slice());
     const snapshot = { info: model.info, steps: model.steps.slice(), coarseTexels: model.coarseTexels.slice(), levels: [range!, texture!] } as Snapshot;
     this.tell({ kind: 'opened', snapshot, fresh }, [snapshot.steps.buffer as ArrayBuffer, snapshot.coarseTexels.buffer as ArrayBuffer]);

@@ -1,5 +1,7 @@
 // Every word the page says, in one place.
 
+import type { Quality } from './api.ts';
+
 export const strings = {
   title: 'foveascan',
   noWebgl: 'This browser draws no WebGL 2, which the page needs. Any current Firefox, Chrome, Edge or Safari does.',
@@ -82,6 +84,7 @@ export const strings = {
   pins: {
     heading: 'Pins',
     none: 'No pins yet. Choose “a click sets a pin”.',
+    noneYet: 'No pins yet.',
     label: 'Label of the new pin',
     add: 'Set the pin',
     cancel: 'Cancel',
@@ -108,6 +111,21 @@ export const strings = {
     address: 'The page’s address is the link to this view.',
     samples: (width: number, height: number, tw: number, th: number) => `${width} × ${height} points, ${tw} × ${th} texels`,
   },
+  worth: {
+    heading: 'What it is worth',
+    sound: 'Nothing speaks against this scan.',
+    unknown: 'It was not swept here, so nothing is known of how it was measured.',
+    figures: (q: Quality): [string, string][] => [
+      ['Measured', `${(100 * q.coverage).toFixed(1)} % of all points`],
+      ['Points missing in holes', q.holes.toLocaleString()],
+      ['Noise of a point', q.noiseMm === null ? 'unknown: nothing was seen twice' : `${q.noiseMm.toPrecision(2)} mm`],
+      ['Moved meanwhile', q.slipDeg === null ? 'unknown: nothing was seen twice' : `${q.slipDeg.toFixed(2)}°`],
+      ['Turns averaged', String(q.passes)],
+      ['Spikes taken out, holes filled', `${q.spikes}, ${q.filled}`],
+      ['Columns asked for again', String(q.requestedColumns)],
+    ],
+  },
+  role: 'You may look, measure and download here. To sweep, to set pins, to name or delete scans, have this browser paired with the role “operate”.',
   cost: {
     heading: 'What it cost',
     received: 'Received',

@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-import hatch_build
 from foveascan import started
 from tests.client.viewer.browser import blank, click, crop, launch, opened, psnr, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
 
-AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
 FAST = ("--link-rate", "20000000")
 
 
@@ -108,35 +106,6 @@ def test_a_lost_graphics_context_comes_back_as_it_was(browser: Browser, node: Ru
         assert psnr(crop(page, 0.5, 0.45, 200), before) > 40
 
 
-def test_everything_can_be_done_by_keyboard(browser: Browser, node: RunningNode) -> None:
-    with opened(browser, node.url) as page:
-        before = crop(page, 0.5, 0.5, 300)
-        tab_to(page, "#view")
-        page.keyboard.press("ArrowLeft")
-        page.keyboard.press("Enter")
-        wait_updates(page, 1)
-        assert psnr(crop(page, 0.5, 0.5, 300), before) < 35
-        page.keyboard.press("Home")
-        tab_to(page, "button:has-text('Sharpen the middle')")
-        page.keyboard.press("Enter")
-        wait_updates(page, 2)
-        tab_to(page, "summary:has-text('Display')")
-        page.keyboard.press("Enter")
-        assert page.get_by_label("Overlay").is_visible()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1000, 360])
-def test_axe_finds_nothing(browser: Browser, node: RunningNode, scheme: str, width: int) -> None:
-    with opened(browser, node.url, color_scheme=scheme, viewport={"width": width, "height": 800}) as page:
-        page.locator("aside details").evaluate_all("(all) => all.forEach((one) => (one.open = true))")
-        page.get_by_label("Overlay").select_option("range")
-        page.evaluate(AXE.read_text())
-        found = page.evaluate("() => axe.run()")
-        assert [(problem["id"], [one["html"] for one in problem["nodes"]]) for problem in found["violations"]] == []
-        assert page.evaluate("() => document.documentElement.scrollWidth") <= width
-
-
 def test_pins_stay_with_the_scan(browser: Browser, node: RunningNode) -> None:
     with opened(browser, node.url) as page:
         page.get_by_label("sets a pin").check()
@@ -163,6 +132,7 @@ def test_a_scan_is_renamed_and_deleted_after_being_asked(browser: Browser, tmp_p
             page.get_by_label("Subject code").fill("P-17")
             page.get_by_role("button", name="Save").click()
             page.get_by_role("button", name="back, left P-17").wait_for()
+            assert page.request.get(f"{line.url}/v1/scans").json()[0]["subject"] == "P-17", "what a list shows"
             page.get_by_role("button", name="Delete the scan").click()
             page.get_by_role("button", name="Keep it").click()
             assert page.get_by_role("button", name="back, left").is_visible()
@@ -248,15 +218,6 @@ def exactly(page: Page) -> None:
     """Ask the next click for all that the scan has, in an area larger than any crop here."""
     page.get_by_label("Quality", exact=True).select_option("exact")
     page.get_by_label("Area round the click").select_option("0.15")
-
-
-def tab_to(page: Page, selector: str) -> None:
-    """Press Tab until something has the focus."""
-    for _ in range(60):
-        if page.locator(selector).evaluate("(element) => element === document.activeElement"):
-            return
-        page.keyboard.press("Tab")
-    raise AssertionError(f"{selector} cannot be reached by Tab")
 
 
 def received(page: Page) -> int:

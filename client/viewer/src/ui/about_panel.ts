@@ -13,6 +13,7 @@ export class AboutPanel {
   private readonly form: HTMLFormElement;
   private readonly dialog: HTMLDialogElement;
   private readonly remove: HTMLButtonElement;
+  private readonly mayNot = h('p', { class: 'quiet', hidden: true }, strings.role);
   private readonly copied = h('p', { class: 'quiet', role: 'status' });
 
   constructor(save: (changes: Changes) => void, remove: () => void) {
@@ -36,7 +37,7 @@ export class AboutPanel {
         h('button', { type: 'button', class: 'danger', click: yes }, about.yes))));
     this.remove = h('button', { type: 'button', class: 'secondary', click: () => this.dialog.showModal() }, about.remove);
     const copy = h('button', { type: 'button', class: 'secondary', click: () => void this.copy() }, about.copy);
-    this.element = section(about.heading, false, this.samples, this.form,
+    this.element = section(about.heading, false, this.samples, this.form, this.mayNot,
       h('p', { class: 'label' }, about.download), this.downloads, copy, this.copied, this.remove, this.dialog);
     this.element.hidden = true;
   }
@@ -54,9 +55,9 @@ export class AboutPanel {
   }
 
   /** What is said of it; null where this node keeps no such thing. */
-  said(sidecar: Sidecar | null, role: string): void {
-    this.form.hidden = !sidecar || role === 'view';
-    this.remove.hidden = !sidecar || role !== 'admin';
+  said(sidecar: Sidecar | null, mayChange: boolean): void {
+    this.form.hidden = this.remove.hidden = !sidecar || !mayChange;
+    this.mayNot.hidden = mayChange;
     if (!sidecar) return;
     for (const name of ['name', 'subject', 'body_site'] as const) this.inputs[name].value = sidecar[name] ?? '';
   }

@@ -55,6 +55,11 @@ export class Frame {
     this.hint.textContent = strings.view.hints[tool];
   }
 
+  /** Whether a sweep may be started here: then it is proposed where there is nothing to see. */
+  allow(sweeps: boolean): void {
+    this.empty.textContent = sweeps ? strings.view.empty : strings.scans.none;
+  }
+
   /** Whether to say that there is nothing to see yet. */
   showEmpty(empty: boolean): void {
     this.empty.hidden = !empty;

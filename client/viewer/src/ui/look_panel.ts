@@ -37,9 +37,10 @@ export class LookPanel {
     );
   }
 
-  choose(tool: Tool): void {
-    this.tool = tool;
-    this.radios[tool]!.checked = true;
+  /** Whether a click may set pins. */
+  allowPins(allowed: boolean): void {
+    this.radios['pin']!.parentElement!.hidden = !allowed;
+    if (!allowed && this.tool === 'pin') this.radios['sharpen']!.click();
   }
 
   private set(name: 'maxWaitS' | 'alpha', value: number): void {

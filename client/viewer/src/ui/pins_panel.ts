@@ -11,6 +11,7 @@ export class PinsPanel {
   private readonly form: HTMLFormElement;
   private readonly note = h('p', { class: 'quiet', hidden: true }, strings.pins.unsaved);
   private place: Place | null = null;
+  private mayChange = true;
 
   constructor(
     private readonly add: (pin: Pin) => void, private readonly remove: (index: number) => void,
@@ -37,12 +38,18 @@ export class PinsPanel {
     this.label.focus();
   }
 
+  /** Whether who looks at the page may set and remove pins; before the next `show`. */
+  allow(allowed: boolean): void {
+    this.mayChange = allowed;
+    if (!allowed) this.ask(null);
+  }
+
   show(pins: Pin[], kept: boolean): void {
     this.note.hidden = kept || pins.length === 0;
     const items = pins.map((pin, index) => h('li', {},
       h('button', { type: 'button', class: 'plain', 'aria-label': strings.pins.go(pin.label), click: () => this.go(pin) }, pin.label || '·'),
-      h('button', { type: 'button', class: 'plain remove', 'aria-label': strings.pins.remove(pin.label), click: () => this.remove(index) }, '×'),
+      !this.mayChange ? null : h('button', { type: 'button', class: 'plain remove', 'aria-label': strings.pins.remove(pin.label), click: () => this.remove(index) }, '×'),
     ));
-    refill(this.list, ...(items.length ? items : [h('li', { class: 'quiet none' }, strings.pins.none)]));
+    refill(this.list, ...(items.length ? items : [h('li', { class: 'quiet none' }, this.mayChange ? strings.pins.none : strings.pins.noneYet)]));
   }
 }

@@ -9,16 +9,18 @@ export class ScannerPanel {
   private readonly progress = h('progress', { max: 100, 'aria-label': strings.scanner.progress, hidden: true });
   private readonly button: HTMLButtonElement;
   private readonly watch: HTMLButtonElement;
+  private readonly mayNot = h('p', { class: 'quiet', hidden: true }, strings.role);
 
   constructor(start: () => void, watch: () => void) {
     this.watch = h('button', { type: 'button', class: 'secondary', hidden: true, click: watch }, strings.scanner.watch);
     this.button = h('button', { type: 'button', click: start }, strings.scanner.start);
-    this.element = section(strings.scanner.heading, true, this.phase, this.progress, this.watch, this.button);
+    this.element = section(strings.scanner.heading, true, this.phase, this.progress, this.watch, this.button, this.mayNot);
   }
 
-  /** Only operators may start sweeps. */
-  allow(role: string): void {
-    this.button.hidden = role === 'view';
+  /** Whether who looks at the page may start sweeps. */
+  allow(allowed: boolean): void {
+    this.button.hidden = !allowed;
+    this.mayNot.hidden = allowed;
   }
 
   show(capture: Capture): void {

@@ -61,6 +61,8 @@ export class Stage {
   private asked = false;
   private moving = false;
   private pace = 1;
+  /** The last picture was drawn more coarsely than could be, to keep up. */
+  private isHasty = false;
   private lastMs = 0;
   private leisure: ReturnType<typeof setTimeout> | undefined;
   private settling: ReturnType<typeof setTimeout> | undefined;
@@ -262,7 +264,8 @@ export class Stage {
     this.asked = false;
     if (this.controls.enableDamping) this.controls.update();
     this.keepPace(nowMs);
-    const detail = this.moving ? { ...this.detail, cellPx: this.detail.cellPx * this.pace } : this.detail;
+    this.isHasty = this.moving && this.pace > 1;
+    const detail = this.isHasty ? { ...this.detail, cellPx: this.detail.cellPx * this.pace } : this.detail;
     const distance = this.camera.position.distanceTo(this.controls.target);
     this.camera.near = Math.max(distance / 400, 0.05);
     this.camera.far = distance + 2e3;
@@ -297,7 +300,7 @@ export class Stage {
   private settle(): void {
     clearTimeout(this.settling);
     this.settling = setTimeout(() => {
-      this.draw();
+      if (this.isHasty) this.draw();
       this.events.settled();
     }, 250);
   }

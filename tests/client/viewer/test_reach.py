@@ -1,0 +1,164 @@
+"""Whoever looks at the page, with whatever: fingers, keys alone, large letters, a narrow screen, the right to look only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+import hatch_build
+from tests.client.viewer.browser import click, crop, launch, opened, psnr, wait_drawn, wait_updates
+from tests.system.line import RunningNode, run_line
+
+AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
+FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        running = launch(playwright)
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
+    """A node with a small head: what is tested here does not depend on its size."""
+    with ExitStack() as stack, ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
+        yield aside.submit(run_line, stack, tmp_path_factory.mktemp("reach")).result()
+
+
+def test_a_tap_sharpens_and_two_fingers_zoom_and_move(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url, has_touch=True, viewport={"width": 400, "height": 800}) as page:
+        box = page.locator("#view").bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.touchscreen.tap(x, y)
+        wait_updates(page, 1)
+        touch = page.context.new_cdp_session(page)
+
+        def fingers(kind: str, *places: tuple[float, float]) -> None:
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": a, "y": b} for a, b in places]})
+
+        def gesture(*steps: list[tuple[float, float]]) -> list[float]:
+            """The camera afterwards: azimuth, elevation, distance, target."""
+            fingers("touchStart", *steps[0])
+            for step in steps[1:]:
+                fingers("touchMove", *step)
+                wait_drawn(page)
+            fingers("touchEnd")
+            return settled_camera(page)
+
+        start = settled_camera(page)
+        turned = gesture([(x, y)], [(x + 30, y)], [(x + 60, y)])
+        assert abs(turned[0] - start[0]) > 0.1
+        nearer = gesture([(x - 20, y), (x + 20, y)], [(x - 40, y), (x + 40, y)], [(x - 60, y), (x + 60, y)])
+        assert nearer[2] < 0.7 * turned[2]
+        moved = gesture([(x - 20, y), (x + 20, y)], [(x - 20, y + 30), (x + 20, y + 30)], [(x - 20, y + 60), (x + 20, y + 60)])
+        assert abs(moved[4] - nearer[4]) > 5
+        assert page.evaluate("document.documentElement.dataset.updates") == "1", "a gesture is no tap"
+
+
+def test_everything_can_be_done_by_keyboard(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        before = crop(page, 0.5, 0.5, 300)
+        tab_to(page, "#view")
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("Enter")
+        wait_updates(page, 1)
+        assert psnr(crop(page, 0.5, 0.5, 300), before) < 35
+        page.keyboard.press("Home")
+        tab_to(page, "button:has-text('Sharpen the middle')")
+        page.keyboard.press("Enter")
+        wait_updates(page, 2)
+        tab_to(page, "summary:has-text('Display')")
+        page.keyboard.press("Enter")
+        assert page.get_by_label("Overlay").is_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1000, 360])
+def test_axe_finds_nothing(browser: Browser, node: RunningNode, scheme: str, width: int) -> None:
+    with opened(browser, node.url, color_scheme=scheme, viewport={"width": width, "height": 800}) as page:
+        unfold(page)
+        page.evaluate(AXE.read_text())
+        found = page.evaluate("() => axe.run()")
+        assert [(problem["id"], [one["html"] for one in problem["nodes"]]) for problem in found["violations"]] == []
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "letters"),
+    [(1280, 800, "100%"), (640, 400, "100%"), (1280, 800, "200%"), (360, 740, "100%"), (360, 740, "200%")],
+    ids=["desk", "desk at 200%", "letters at 200%", "phone", "phone, letters at 200%"],
+)
+def test_nothing_is_cut_and_nothing_lies_on_anything(
+    browser: Browser, node: RunningNode, width: int, height: int, letters: str
+) -> None:
+    with opened(browser, node.url, viewport={"width": width, "height": height}) as page:
+        page.evaluate("(size) => { document.documentElement.style.fontSize = size; }", letters)
+        unfold(page)
+        wait_drawn(page)
+        assert not (faults := page.evaluate(FAULTS)), faults
+        for name in ("Sharpen the middle", "Copy a link"):
+            button = page.get_by_role("button", name=name)
+            button.scroll_into_view_if_needed()
+            button.click(trial=True)
+
+
+def test_what_moves_by_itself_stands_still_where_that_is_asked_for(browser: Browser, node: RunningNode) -> None:
+    for motion, turns in (("reduce", "none"), ("no-preference", "turn")):
+        with opened(browser, node.url, reduced_motion=motion) as page:
+            assert page.evaluate("() => getComputedStyle(document.querySelector('.busy'), '::before').animationName") == turns
+            drag(page)
+            camera, later = settled_camera(page), None
+            if motion == "reduce":
+                page.wait_for_timeout(200)
+                later = settled_camera(page)
+                assert later == camera
+
+
+def test_what_a_sweep_is_worth_is_said(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        panel = page.locator("details", has=page.locator("summary", has_text="What it is worth"))
+        panel.locator("summary").click()
+        measured = panel.locator("dt", has_text="Measured").locator("+ dd").text_content() or ""
+        truth = page.request.get(f"{node.url}/v1/scans/latest").json()["quality"]
+        assert measured == f"{100 * truth['coverage']:.1f} % of all points"
+        assert panel.get_by_text("Nothing speaks against this scan.").is_visible() == (not truth.get("complaints"))
+        assert panel.locator("dt", has_text="Noise").locator("+ dd").text_content() == "unknown: nothing was seen twice"
+
+
+def drag(page: Page) -> None:
+    box = page.locator("#view").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 200, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 260, box["y"] + 200, steps=4)
+    page.mouse.up()
+
+
+def unfold(page: Page) -> None:
+    """Open all panels, and lay what can be laid over the picture."""
+    page.locator("aside details").evaluate_all("(all) => all.forEach((one) => (one.open = true))")
+    page.get_by_label("Overlay").select_option("range")
+
+
+def settled_camera(page: Page) -> list[float]:
+    """The camera as the address has it once it has come to rest: azimuth, elevation, distance, target."""
+    page.wait_for_timeout(600)
+    return [float(number) for number in page.evaluate("() => new URLSearchParams(location.hash.slice(1)).get('camera').split(',')")]
+
+
+def tab_to(page: Page, selector: str) -> None:
+    """Press Tab until something has the focus."""
+    for _ in range(60):
+        if page.locator(selector).evaluate("(element) => element === document.activeElement"):
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"{selector} cannot be reached by Tab")
