@@ -44,7 +44,8 @@ def tasks_ms(browser: Browser, address: str) -> list[float]:
         page.wait_for_selector("canvas:not(#view)", state="attached")
         page.wait_for_timeout(1500)  # charts are drawn once a second
         events: list[dict[str, Any]] = json.loads(browser.stop_tracing())["traceEvents"]
-    ours = next(one["pid"] for one in events if one["name"] == "ResourceSendRequest" and f"{address}/" in str(one["args"]))
+    asked = (one for one in events if one["name"] == "ResourceSendRequest")
+    ours = next(one["pid"] for one in asked if f"{address}/" in str(one["args"]))
     main = next(one["tid"] for one in events if one["pid"] == ours and one["args"].get("name") == "CrRendererMain")
     tasks = [one for one in events if one["name"] == TASK and (one["pid"], one["tid"]) == (ours, main)]
     return [one["tdur"] / 1000 for one in tasks if "tdur" in one]  # what tracing itself cut short has none
