@@ -14,6 +14,7 @@ from enum import IntEnum
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from exchange.cast import cast_mesh, to_steps
 from exchange.ends import POINTS, SIDES, End, find_end, lid_colours, paint_lid, with_end
@@ -32,7 +33,7 @@ from exchange.star import (
     solid_share,
 )
 from exchange.sweeps import Sweep, surface_towards
-from protocol.grid import HEIGHT_MAX, STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray
+from protocol.grid import HEIGHT_MAX, STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, StepArray
 from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid
 
@@ -44,6 +45,7 @@ TEXEL_ROWS_OF = 16
 _NO_TEXTURE = np.zeros((1, 1, 3), np.uint8)
 
 Progress = Callable[[float], object]
+SourceArray = NDArray[np.uint8]  # of _Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +108,14 @@ def close_scan(
     top, bottom = (find_end(grid.spec, grid.range_steps, side, cap=caps) for side in SIDES)
     view = _View(grid, (top, bottom), _fitted(grid, (top, bottom), centre_mm, REACH_MARGIN if sweeps else 1.0))
     fits = [sweep.fitted(grid) for sweep in sweeps]
-    range_mm, source = _ranges(view)
+    steps, source = _ranges(view)
     progress(0.2)
     others = [_look_at(view, sweep, found, source) for sweep, found in zip(sweeps, fits, strict=True)]
-    _fill(range_mm, source, others)
-    spec = replace(view.spec, pitch_mm=math.pi * float(np.nanmean(range_mm)) / view.spec.height)
+    _fill(steps, source, others)
+    mean_mm = view.spec.step_mm * float(steps.mean(where=steps != VOID))
+    spec = replace(view.spec, pitch_mm=math.pi * mean_mm / view.spec.height)
     texture = _texture(view, source, others, lambda share: progress(0.2 + 0.8 * share))
-    closed = thin_grid(Grid(spec, to_steps(range_mm, spec.step_mm), texture))
+    closed = thin_grid(Grid(spec, steps, texture))
     hidden = _hidden(view, closed)
     if hidden > HIDDEN_MAX:
         raise ExchangeError(
@@ -144,7 +147,7 @@ class _Seen:
     range_mm: FloatArray
     row: FloatArray
     rim: FloatArray
-    source: IntArray
+    source: SourceArray
     lower: BoolArray
 
 
@@ -178,7 +181,8 @@ class _View:
         void = np.isnan(place)
         at = np.where(void, POINTS, place)
         upper, lower = at < POINTS - 1, at > POINTS + height
-        source = np.where(self._edge_on(rays.row_at(out, z), at), _Source.EDGE_ON, _Source.SAMPLES)
+        edge_on = self._edge_on(rays.row_at(out, z), at)
+        source = np.where(edge_on, np.uint8(_Source.EDGE_ON), np.uint8(_Source.SAMPLES))
         for end, there in zip(self.ends, (upper, lower), strict=True):
             source[there] = _Source.CAP if end is not None and end.capped else _Source.ROUND
         source[void] = _Source.VOID
@@ -192,19 +196,19 @@ class _View:
         return far
 
 
-def _ranges(view: _View) -> tuple[FloatArray, IntArray]:
-    """Range of all directions (H, W) [mm], NaN = void, and where it comes from."""
+def _ranges(view: _View) -> tuple[StepArray, SourceArray]:
+    """Range of all directions, and where it comes from. (H, W) each"""
     width, height = view.spec.width, view.spec.height
-    range_mm, source = np.full((height, width), np.nan), np.zeros((height, width), np.int64)
+    steps, source = np.zeros((height, width), np.uint16), np.zeros((height, width), np.uint8)
     for columns in view.strips(height, width):
         seen = view.look(columns, width, height)
-        range_mm[:, columns], source[:, columns] = seen.range_mm, seen.source
-    if np.isnan(range_mm).all():
+        steps[:, columns], source[:, columns] = to_steps(seen.range_mm, view.spec.step_mm), seen.source
+    if not steps.any():
         raise ExchangeError("scan: nothing is measured")
-    return range_mm, source
+    return steps, source
 
 
-def _look_at(view: _View, sweep: Sweep, found: Fit, source: IntArray) -> Grid | None:
+def _look_at(view: _View, sweep: Sweep, found: Fit, source: SourceArray) -> Grid | None:
     """A sweep as the centre sees it, where the scan itself has nothing good."""
     spec = view.spec
     poor = np.not_equal(source, _Source.SAMPLES)
@@ -212,15 +216,15 @@ def _look_at(view: _View, sweep: Sweep, found: Fit, source: IntArray) -> Grid | 
     return None if mesh is None else cast_mesh(mesh, spec)
 
 
-def _fill(range_mm: FloatArray, source: IntArray, others: Sequence[Grid | None]) -> None:
+def _fill(steps: StepArray, source: SourceArray, others: Sequence[Grid | None]) -> None:
     """Take from sweeps what the scan does not have, or saw edge-on."""
     for n, other in enumerate(others):
         if other is not None:
             taken = (source != _Source.SAMPLES) & (source < _Source.SWEEP) & (other.range_steps != VOID)
-            range_mm[taken], source[taken] = other.range_mm[taken], _Source.SWEEP + n
+            steps[taken], source[taken] = other.range_steps[taken], _Source.SWEEP + n
 
 
-def _texture(view: _View, ranges: IntArray, others: Sequence[Grid | None], progress: Progress) -> ImageArray:
+def _texture(view: _View, ranges: SourceArray, others: Sequence[Grid | None], progress: Progress) -> ImageArray:
     """Colours of all directions, black where nothing is. (Ht, Wt, 3) uint8   ranges : where range comes from."""
     width, height = view.spec.texture_width, view.spec.texture_height
     texture = np.zeros((height, width, 3), np.uint8)
@@ -266,7 +270,7 @@ def _hidden(view: _View, closed: Grid) -> float:
         out, z = profiles(view.grid.spec, range_mm)
         area, (out, z) = _area(out, z), ((a[1:] + a[:-1]) / 2 for a in (out, z))
         row = np.clip(np.rint(np.nan_to_num(rays.row_at(out, z))), 0, spec.height - 1).astype(np.int64)
-        surface = np.take_along_axis(nearest[:, columns], row, axis=0)
+        surface = np.take_along_axis(nearest[:, columns], row, axis=0) * spec.step_mm
         below = np.hypot(out, z - spec.z_max_mm) < (1 - DEPTH_TOLERANCE) * surface
         hidden_mm2 += float(area[below].sum())
         area_mm2 += float(area.sum())

@@ -15,7 +15,7 @@ import numpy as np
 
 from exchange.cast import STEP_MIN_MM, Mesh, cast_mesh
 from exchange.errors import ExchangeError
-from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec
+from protocol.grid import STEPS_MAX, VOID, BoolArray, FloatArray, Grid, GridSpec, StepArray
 from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid, directions
 
@@ -153,15 +153,15 @@ def _hidden(corners: FloatArray, grid: Grid) -> float:
         distance = np.linalg.norm(middle, axis=1)
         area = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1)
         area, middle, distance = area[distance > 0], middle[distance > 0], distance[distance > 0]
-        surface = nearest[DirectionGrid.of(grid.spec).snap(*directions(middle))]
+        surface = nearest[DirectionGrid.of(grid.spec).snap(*directions(middle))] * grid.spec.step_mm
         hidden_mm2 += float(area[distance < (1 - DEPTH_TOLERANCE) * surface].sum())
         area_mm2 += float(area.sum())
     return hidden_mm2 / area_mm2 if area_mm2 else 0.0
 
 
-def nearest_round(grid: Grid) -> FloatArray:
-    """The least range of each sample and its neighbours, so that a steep side does not count as hidden. (H, W) [mm]"""
-    far = np.where(_measured(grid), grid.range_steps, STEPS_MAX).astype(np.float64) * grid.spec.step_mm
+def nearest_round(grid: Grid) -> StepArray:
+    """The least range of each sample and its neighbours, so that a steep side does not count as hidden. (H, W) steps"""
+    far = np.where(_measured(grid), grid.range_steps, np.uint16(STEPS_MAX))
     across = np.minimum(np.minimum(np.roll(far, 1, 1), np.roll(far, -1, 1)), far)
     padded = np.pad(across, ((1, 1), (0, 0)), mode="edge")
     return np.asarray(np.minimum(np.minimum(padded[:-2], padded[2:]), across))
