@@ -47,6 +47,7 @@ _CLEAR_HALT = 0x80045515
 _CLAIM, _RELEASE = 0x8004550F, 0x80045510
 _ACCEPTED = {_CLAIM, _RELEASE, _CLEAR_HALT, 0x80045505, 0x80085504, 0x5514}
 _HIGH_SPEED = 3
+_NUMBERS = 16  # devices that one place sees before their numbers meet those of the next
 
 
 @dataclass(slots=True)
@@ -83,17 +84,25 @@ class _Plugged:
 class UsbTestbed:
     """One simulated USB device under a folder, as a carrier's port: `read` and `write` are the device's end.
 
-    rate_bytes_s : speed towards the node.   Other files under `root` (udev's sockets) are left alone.
+    rate_bytes_s : speed towards the node.   place : where it is plugged in, 1..7; several beds may share a root.
+    Other files under `root` (udev's sockets) are left alone.
     """
 
-    def __init__(self, root: Path, identity: UsbIdentity | None = None, rate_bytes_s: float = float("inf")) -> None:
+    def __init__(
+        self,
+        root: Path,
+        identity: UsbIdentity | None = None,
+        rate_bytes_s: float = float("inf"),
+        place: int = 1,
+    ) -> None:
         self.identity = identity or UsbIdentity()
         self.name = self.identity.address
         self.stalls = 0  # transfers that the device will refuse next
         self._root = root
         self._rate_bytes_s = rate_bytes_s
         self._free_s = 0.0
-        self._plugged = _Plugged(1, is_gone=True)
+        self._port = f"1-{place}"
+        self._plugged = _Plugged(place * _NUMBERS, is_gone=True)
         self._changed = threading.Condition()
         self._out: deque[memoryview] = deque()
         self._in: deque[bytes] = deque()
@@ -186,11 +195,11 @@ class UsbTestbed:
 
     @property
     def _sysfs(self) -> Path:
-        return self._root / "sys/devices/pci0000:00/usb1/1-1"
+        return self._root / "sys/devices/pci0000:00/usb1" / self._port
 
     @property
     def _sysfs_link(self) -> Path:
-        return self._root / "sys/bus/usb/devices/1-1"
+        return self._root / "sys/bus/usb/devices" / self._port
 
     @property
     def _ioctls(self) -> Path:
@@ -214,13 +223,13 @@ class UsbTestbed:
             (self._sysfs / name).write_text(text + "\n")
         (self._sysfs / "descriptors").write_bytes(ids.device_descriptor() + ids.configuration_descriptor())
         (self._sysfs / "subsystem").symlink_to("../../../../bus/usb")
-        self._sysfs_link.symlink_to("../../../devices/pci0000:00/usb1/1-1")
+        self._sysfs_link.symlink_to(f"../../../devices/pci0000:00/usb1/{self._port}")
         self._node.touch()
 
     def _properties(self) -> dict[str, str]:
         """As udev tells them."""
         return {
-            "DEVPATH": "/devices/pci0000:00/usb1/1-1", "SUBSYSTEM": "usb", "DEVNAME": self._device_path,
+            "DEVPATH": f"/devices/pci0000:00/usb1/{self._port}", "SUBSYSTEM": "usb", "DEVNAME": self._device_path,
             "DEVTYPE": "usb_device", "DRIVER": "usb", "BUSNUM": "001", "DEVNUM": f"{self._plugged.number:03d}",
             "MAJOR": "189", "MINOR": f"{self._plugged.number - 1}",
         }  # fmt: skip

@@ -71,6 +71,7 @@ class Bench:
     order: Order = Order.LIVE
     retention_columns: int = 65535
     payload_max: int = 1024
+    place: int = 1  # where on the bus it is plugged in
 
     def scanner(self) -> FaultyScanner:
         """The device on its bad day."""
@@ -135,9 +136,10 @@ def usb(bench: Bench) -> Iterator[Line]:
     """The driver for USB on the real libusb, with an emulated device; only under umockdev's preload."""
     if bench.faults == "dribble=1":  # every transfer costs the emulation a millisecond
         bench = replace(bench, faults="dribble=100")
-    bed = UsbTestbed(Path(os.environ["UMOCKDEV_DIR"]), UsbIdentity(serial_number=bench.serial_number))
+    identity = UsbIdentity(serial_number=bench.serial_number)
+    bed = UsbTestbed(Path(os.environ["UMOCKDEV_DIR"]), identity, place=bench.place)
     with closing(bed), _served(replace(bench, payload_max=USB_PAYLOAD_MAX), bed):
-        address = UsbAddress.parse(bed.identity.address)
+        address = UsbAddress.parse(f"{bed.identity.address}:{bench.serial_number}")
         yield Line(lambda: UsbPort(address), time.monotonic, time.sleep, USB_CONFIG)
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers.serial_port import SerialPort
 from node.scan_quality import ScanQuality
 from protocol.errors import PortLost
 from protocol.scanner_messages import Channel, Order, SweepRequest
@@ -65,8 +64,6 @@ def test_what_the_link_can_repair_leaves_no_trace(carrier: Carrier, faults: str,
 
 @pytest.mark.parametrize("faults", CUT)
 def test_what_ends_a_sweep_leaves_it_on_disk_as_interrupted(carrier: Carrier, faults: str, tmp_path: Path) -> None:
-    if carrier is not memory and faults == "stall=30":
-        pytest.skip("30 s in real time; the line in memory does it")
     ending = swept(carrier, Bench(faults, 2, tmp_path))
     assert ending.kind == "interrupted" and ending.assembly is None
     (sweep,) = ending.kept
@@ -96,15 +93,15 @@ def test_a_device_of_another_major_version_is_refused_by_name(carrier: Carrier, 
     assert ending.kind == "refused" and "speaks link version 2, this node 1.1" in ending.why and not ending.kept
 
 
-def test_two_scanners_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
+def test_two_scanners_at_once_do_not_disturb_each_other(carrier: Carrier, tmp_path: Path) -> None:
     endings: dict[str, Ending] = {}
 
-    def sweep(name: str) -> None:
+    def sweep(number: int, name: str) -> None:
         folder = tmp_path / name
         folder.mkdir()
-        endings[name] = swept(pty, Bench("loss=0.01", 6, folder, serial_number=name))
+        endings[name] = swept(carrier, Bench("loss=0.01", 6, folder, serial_number=name, place=number))
 
-    threads = [threading.Thread(target=sweep, args=(name,)) for name in ("ONE", "TWO")]
+    threads = [threading.Thread(target=sweep, args=named) for named in ((1, "ONE"), (2, "TWO"))]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -112,12 +109,12 @@ def test_two_scanners_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
     assert {name: ending.equals(bumpy().grid) for name, ending in endings.items()} == {"ONE": True, "TWO": True}
 
 
-def test_one_port_opened_twice_is_refused_the_second_time(tmp_path: Path) -> None:
-    with pty(Bench("", 7, tmp_path)) as line:
-        first = line.open_port()
-        with pytest.raises(PortLost, match="cannot open"):
-            SerialPort(first.name)
-        first.close()
+def test_one_port_opened_twice_is_refused_the_second_time(carrier: Carrier, tmp_path: Path) -> None:
+    if carrier in (memory, usb_double):
+        pytest.skip("what keeps a second program out is the kernel, or its emulation")
+    with carrier(Bench("", 7, tmp_path)) as line, closing(line.open_port()):
+        with pytest.raises(PortLost, match="another program"):
+            line.open_port()
 
 
 @pytest.mark.parametrize("faults", ["", "loss=0.02", "unplug=0.2"])
