@@ -1,8 +1,8 @@
 """Which scanners are plugged in, and how a setting finds its port.
 
 A port is named by a device path (best one of /dev/serial/by-id/, which stays the same wherever it is plugged in),
-by `serial:VID:PID[:SERIAL]`, or by `usb:VID:PID[:SERIAL]`. The latter two are looked up whenever the port is opened,
-so a scanner is found again under whatever name it comes back.
+by `serial:VID:PID[:SERIAL]`, by `usb:VID:PID[:SERIAL]`, or by `tcp:HOST:PORT`. Those with ids are looked up whenever
+the port is opened, so a scanner is found again under whatever name it comes back.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from serial.tools import list_ports
 from drivers.port import Port
 from drivers.serial_port import SerialPort
 from drivers.sweep import ScannerConfig
+from drivers.tcp_port import TcpPort
 from drivers.usb_port import UsbAddress, UsbPort
 from protocol.errors import PortLost
 from protocol.framing import USB_PAYLOAD_MAX
@@ -68,14 +69,16 @@ def open_port(address: str, baud: int = 3_000_000) -> Port:
             return UsbPort(UsbAddress.parse(address))
         except ValueError as error:
             raise PortLost(str(error)) from error
+    if address.startswith("tcp:"):
+        return TcpPort(address)
     if address.startswith("serial:"):
         return SerialPort(_serial_path(address), baud)
     return SerialPort(address, baud)
 
 
 def config_for(address: str, quiet_s: float = 2.0) -> ScannerConfig:
-    """How to talk over the port at an address: USB takes longer frames and runs further ahead."""
-    if address.startswith("usb:"):
+    """How to talk over the port at an address: USB and TCP take longer frames and run further ahead."""
+    if address.startswith(("usb:", "tcp:")):
         return ScannerConfig(quiet_s=quiet_s, payload_max=USB_PAYLOAD_MAX, window_bytes=USB_WINDOW_BYTES)
     return ScannerConfig(quiet_s=quiet_s)
 

@@ -9,7 +9,7 @@ from node.access_command import add_access_commands
 from node.install_command import add_install_command
 from node.library_command import add_library_command
 
-ADDRESS = "the scanner's: path of a serial port, serial:VID:PID[:SERIAL] or usb:VID:PID[:SERIAL]"
+ADDRESS = "the scanner's: path of a serial port, serial:VID:PID[:SERIAL], usb:VID:PID[:SERIAL] or tcp:HOST:PORT"
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

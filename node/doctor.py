@@ -59,7 +59,7 @@ ENDS_SOON = dt.timedelta(days=14)
 ANSWER_S = 2.0
 ANSWER_BYTES_MAX = 65536
 
-LOOKED_UP = ("usb:", "serial:")  # addresses that are no paths
+LOOKED_UP = ("usb:", "serial:", "tcp:")  # addresses that are no paths
 
 State = Literal["ok", "warning", "problem"]
 

@@ -49,7 +49,7 @@ class Device(Protocol):
 
 
 class ServedPort(Protocol):
-    """The device's end of a carrier: a PtyPort, a UsbTestbed, a UsbDouble."""
+    """The device's end of a carrier: a PtyPort, a TcpListener, a UsbTestbed, a UsbDouble."""
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """What the node wrote; b"" when the time is over or `cancel` was called."""

@@ -27,12 +27,13 @@ USB_PORTION_BYTES = 65536
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `simulate`."""
     simulate = subparsers.add_parser("simulate", help="a software scanner with known truth")
-    simulate.add_argument("--link", choices=("pty", "usb"), default="pty", help="what the node opens (pty)")
+    simulate.add_argument("--link", choices=("pty", "tcp", "usb"), default="pty", help="what the node opens (pty)")
     simulate.add_argument(
         "--path",
         required=True,
         type=Path,
-        help="pty: symbolic link to create for the node to open; usb: folder for the emulated device",
+        help="pty: symbolic link to create for the node to open; tcp: PORT or HOST:PORT to listen at (this machine"
+        " alone; 0: any free port); usb: folder for the emulated device",
     )
     simulate.add_argument(
         "--specimen",
@@ -50,7 +51,8 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
         "--jitter", type=_real(0, 1e6), default=0.0, metavar="COUNTS", help="deviation of the triggers (0)"
     )
     speed = simulate.add_mutually_exclusive_group()
-    speed.add_argument("--baud", type=_whole(300, 10**9), help="of the line (pty: 3000000; usb: 35e6 bytes a second)")
+    baud_help = "of the line (pty: 3000000; tcp, usb: 35e6 bytes a second)"
+    speed.add_argument("--baud", type=_whole(300, 10**9), help=baud_help)
     speed.add_argument(
         "--link-rate", type=_real(30, 1e9), metavar="BYTES_S", help="bytes a second over the line, instead of --baud"
     )
@@ -86,7 +88,7 @@ def run_simulate(args: argparse.Namespace) -> int:
         if path is not None and grid is not None:
             with whole_file(path) as file:
                 write_native(grid, file, specimen.name)
-    portion = USB_PORTION_BYTES if args.link == "usb" else PORTION_BYTES
+    portion = PORTION_BYTES if args.link == "pty" else USB_PORTION_BYTES
     with _port(args) as (port, about), _stopped_by_signals(port) as stop:
         print(_ready(args, specimen, about), flush=True)
         serve(scanner, port, stop, portion)
@@ -110,7 +112,7 @@ def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
             serial_number=args.serial_number,
             boot_id=boot_id,
             retention_columns=args.retention,
-            payload_max=USB_PAYLOAD_MAX if args.link == "usb" else SERIAL_PAYLOAD_MAX,
+            payload_max=SERIAL_PAYLOAD_MAX if args.link == "pty" else USB_PAYLOAD_MAX,
             order=Order[args.order.upper()],
         )
 
@@ -121,6 +123,7 @@ def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
 def _port(args: argparse.Namespace) -> Iterator[tuple[ServedPort, dict[str, Any]]]:
     """The scanner's end of the line, and what the node has to know of it."""
     from simulators.carriers import PtyPort
+    from simulators.tcp_carrier import TcpListener, parse_listen
     from simulators.usb_descriptors import UsbIdentity
     from simulators.usb_testbed import UsbTestbed
 
@@ -129,6 +132,9 @@ def _port(args: argparse.Namespace) -> Iterator[tuple[ServedPort, dict[str, Any]
         identity = UsbIdentity(serial_number=args.serial_number)
         with closing(UsbTestbed(args.path, identity, rate_bytes_s or USB_BYTES_S)) as bed:
             yield bed, {"path": identity.address, "environment": bed.environment}
+    elif args.link == "tcp":
+        with closing(TcpListener(parse_listen(str(args.path)), rate_bytes_s or USB_BYTES_S)) as listener:
+            yield listener, {"path": listener.name}
     else:
         baud = round(BITS_PER_BYTE * rate_bytes_s) or BAUD
         with closing(PtyPort(args.path, baud)) as pty:
@@ -149,7 +155,7 @@ def _ready(args: argparse.Namespace, specimen: Specimen, about: dict[str, Any]) 
     if args.link == "usb":
         variables = " ".join(f"{key}={shlex.quote(value)}" for key, value in about["environment"].items())
         return f"{said}. Start the node so: {variables} foveascan serve --scanner {about['path']} ... Ctrl-C ends it."
-    return f"{said}, {about['baud']} baud. Ctrl-C ends it."
+    return f"{said}{', {baud} baud'.format(**about) if 'baud' in about else ''}. Ctrl-C ends it."
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from drivers.port import Port
 from drivers.scanner import Scanner, ScannerConfig, SweepEvent, SweepFinished, SweepInterrupted, SweepStarted
 from drivers.serial_port import SerialPort
 from drivers.sweep import SweepReport
+from drivers.tcp_port import TcpPort
 from drivers.usb_port import UsbAddress, UsbPort
 from node.assemble import Assembler, Assembly
 from node.journal import Interrupted, Journal, Journals
@@ -32,6 +33,7 @@ from simulators.carriers import MemoryPort, PtyPort, ServedPort, serve
 from simulators.faults import FaultyScanner, parse_faults
 from simulators.scanner import SimulatedScanner
 from simulators.specimen import Specimen
+from simulators.tcp_carrier import TcpListener
 from simulators.turntable import Turntable
 from simulators.usb_descriptors import UsbIdentity
 from simulators.usb_double import UsbDouble
@@ -120,6 +122,14 @@ def pty(bench: Bench) -> Iterator[Line]:
     path = bench.folder / f"{bench.serial_number}.tty"
     with closing(PtyPort(path, 100_000_000)) as port, _served(bench, port):
         yield Line(lambda: SerialPort(str(path)), time.monotonic, time.sleep, ScannerConfig(quiet_s=0.8))
+
+
+@contextmanager
+def tcp(bench: Bench) -> Iterator[Line]:
+    """A TCP connection on this machine."""
+    config = replace(USB_CONFIG, window_bytes=1 << 16)
+    with closing(TcpListener(("127.0.0.1", 0))) as port, _served(replace(bench, payload_max=USB_PAYLOAD_MAX), port):
+        yield Line(lambda: TcpPort(port.name), time.monotonic, time.sleep, config)
 
 
 @contextmanager

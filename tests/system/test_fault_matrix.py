@@ -14,10 +14,10 @@ from node.scan_quality import ScanQuality
 from protocol.errors import PortLost
 from protocol.scanner_messages import Channel, Order, SweepRequest
 from simulators.usb_testbed import is_available, is_under_preload
-from tests.system.fault_rig import REQUEST, Bench, Capturing, Ending, Line, bumpy, memory, pty, usb, usb_double
+from tests.system.fault_rig import REQUEST, Bench, Capturing, Ending, Line, bumpy, memory, pty, tcp, usb, usb_double
 
 Carrier = Callable[[Bench], AbstractContextManager[Line]]
-CARRIERS = {"memory": memory, "pty": pty}
+CARRIERS = {"memory": memory, "pty": pty, "tcp": tcp}
 if is_under_preload():  # in the process that test_usb.py starts
     CARRIERS["usb"] = usb
 elif not is_available():
@@ -110,7 +110,7 @@ def test_two_scanners_at_once_do_not_disturb_each_other(carrier: Carrier, tmp_pa
 
 
 def test_one_port_opened_twice_is_refused_the_second_time(carrier: Carrier, tmp_path: Path) -> None:
-    if carrier in (memory, usb_double):
+    if carrier not in (pty, usb):
         pytest.skip("what keeps a second program out is the kernel, or its emulation")
     with carrier(Bench("", 7, tmp_path)) as line, closing(line.open_port()):
         with pytest.raises(PortLost, match="another program"):
