@@ -173,8 +173,8 @@ async def test_a_client_that_clicks_as_fast_as_it_can_notices_nothing(tmp_path: 
         connect(node.url, node.token("view"), node.tls.fingerprint) as session,
     ):
         await session.open()
-        for at in range(200):
-            assert (await session.look(at / 200, 0.5)).reason in ("complete", "superseded")
+        answered = [await session.look(at / 200, 0.5) for at in range(200)]
+    assert [update.request for update in answered] == list(range(answered[0].request, answered[0].request + 200))
 
 
 async def test_who_does_not_read_the_answer_is_cut_off(tmp_path: Path) -> None:
