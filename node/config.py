@@ -99,7 +99,7 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     requests_per_address: Annotated[int, Meta(ge=1, le=4096)] = 64  # in work at once, streams apart
     requests_s_per_address: Annotated[float, Meta(ge=1, le=1e5)] = 500.0  # [1/s], and twice as many at once
     messages_s: Annotated[float, Meta(ge=1, le=1e5)] = 200.0  # [1/s] on one stream, and twice as many at once
-    head_s: Annotated[float, Meta(ge=1, le=600)] = 10.0  # [s] a handshake may take, and then the first request's head
+    head_s: Annotated[float, Meta(ge=1, le=600)] = 30.0  # [s] a handshake may take, and then the first request's head
     body_s: Annotated[float, Meta(ge=1, le=600)] = 20.0  # [s] a small body may take
     stall_s: Annotated[float, Meta(ge=1, le=3600)] = 60.0  # [s] that nothing goes out to who takes an answer
     keep_s: Annotated[float, Meta(ge=1, le=3600)] = 75.0  # [s] that a connection is kept on which nothing is asked

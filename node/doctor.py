@@ -29,6 +29,7 @@ from drivers.discover import config_for, find_ports, open_port
 from node import config as settings
 from node.access import FOLDER
 from node.advertise import HEARD_S, is_heard
+from node.audit import FOLDER as AUDIT
 from node.durable import EASY_BYTES
 from node.identity import node_identity
 from node.library import survey
@@ -94,6 +95,7 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     yield check_clock(time.time(), written_last_s(Path(__file__), library), is_clock_synchronised())
     yield check_discovery(config, who == "node")
     yield check_library(library)
+    yield check_audit(library, account)
 
 
 def examine_scanner(address: str, path: Path | None, overrides: Mapping[str, object]) -> Iterator[Finding]:
@@ -321,6 +323,28 @@ def check_library(folder: Path) -> Finding:
     found += f", and beside them {counted(len(problems), 'thing')}: {name_problems(problems)}"
     cure = "they are left alone: move away what does not belong there, restore damaged scans from a backup"
     return Finding("library", "warning", found, cure)
+
+
+def check_audit(library: Path, account: Account) -> Finding:
+    """Whether the node can go on with its audit log, and others cannot read it."""
+    folder = library / AUDIT
+    try:
+        places = [folder, *folder.iterdir()]
+        for place in places:
+            info = place.stat()
+            wanted = READ | WRITE | (SEARCH if place is folder else 0)
+            if not account.may(info, wanted):
+                cure = f"chown -R {account.name} {folder}"
+                return Finding("audit log", "problem", f"{account.name} may not write {place}", cure)
+            if info.st_mode & 0o077:
+                return Finding("audit log", "problem", f"others may read {place}", f"chmod -R go= {folder}")
+    except FileNotFoundError:
+        return Finding("audit log", "ok", "none yet: the node begins one when it starts")
+    except PermissionError:
+        return Finding("audit log", "ok", f"{folder}; what is in it cannot be looked at without permission")
+    except OSError as error:
+        return Finding("audit log", "problem", f"{folder}: {error.strerror}", "move it away, and restart the node")
+    return Finding("audit log", "ok", str(folder))
 
 
 def _nearest(folder: Path) -> Path:

@@ -20,6 +20,7 @@ import foveascan
 from node import config as settings
 from node import doctor, machine
 from node.access import access_folder
+from node.audit import done_trail
 from node.doctor import Finding
 from node.durable import EASY_BYTES
 from node.library import About, Library
@@ -296,6 +297,23 @@ def test_the_command_prints_a_line_a_check_and_fails_where_there_is_a_problem(
     records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {"check", "state", "found", "cure"} == set(records[0])
     assert {record["check"]: record["state"] for record in records}["port"] == "problem"
+
+
+# Audit log
+
+
+def test_an_audit_log_that_the_node_cannot_write_or_others_can_read_is_a_problem(tmp_path: Path) -> None:
+    mine = Account("me", os.geteuid(), frozenset({os.getegid()}))
+    assert states(doctor.check_audit(tmp_path, mine)) == ["ok"]
+    done_trail(tmp_path, 8000).append([b"{}"])
+    assert states(doctor.check_audit(tmp_path, mine)) == ["ok"]
+    stranger = doctor.check_audit(tmp_path, STRANGER)
+    assert (stranger.state, stranger.cure) == ("problem", f"chown -R stranger {tmp_path / 'audit'}")
+    os.chmod(tmp_path / "audit" / "audit.jsonl", 0o644)
+    assert "others may read" in doctor.check_audit(tmp_path, mine).found
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "audit").write_text("no folder")
+    assert doctor.check_audit(tmp_path / "elsewhere", mine).found.endswith("audit: Not a directory")
 
 
 # Certificate
