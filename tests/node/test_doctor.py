@@ -58,7 +58,7 @@ def test_every_check_has_its_say(tmp_path: Path) -> None:
     findings = list(doctor.examine(None, {"library.folder": str(tmp_path), "server.listen": "127.0.0.1:0"}))
     assert [finding.check for finding in findings] == [
         "configuration", "port", "permission", "server", "certificate", "disk", "memory", "clock", "discovery",
-        "library",
+        "library", "audit log",
     ]  # fmt: skip
     assert all(finding.cure for finding in findings if finding.state != "ok")
 
