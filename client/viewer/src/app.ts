@@ -21,7 +21,7 @@ import { ScannerPanel } from './ui/scanner_panel.ts';
 import { WorthPanel } from './ui/worth_panel.ts';
 import { formatState, parseState } from './url_state.ts';
 import type { Pin } from './url_state.ts';
-import type { Place } from './view/pick.ts';
+import type { Place } from './view/room.ts';
 import { Stage } from './view/stage.ts';
 
 const CAPTURE_MS = 2000;
@@ -320,9 +320,9 @@ export class App {
     if (distance !== null) this.frame.say(`${strings.measure.heading}: ${strings.measure.result(distance)}, ${strings.measure.straight}`);
   }
 
-  private goTo({ u }: Pin): void {
+  private goTo(pin: Pin): void {
     if (!this.info) return;
-    this.stage.place({ ...this.stage.placed, azimuth: this.info.theta0Rad + 2 * Math.PI * u });
+    this.stage.face(pin);
     this.writeState();
   }
 

@@ -38,6 +38,8 @@ export class Stream {
   private model: Model | null = null;
   /** The scan that the page wants to see. */
   private wanted: string | null = null;
+  /** Asked for by the page, and not told it yet. */
+  private unseen = false;
   /** Messages that have come and are not taken yet, and patches that the page shall get with what they bring. */
   private waiting = 0;
   private patches: Extract<FromWorker, { kind: 'patch' }>[] = [];
@@ -71,11 +73,12 @@ export class Stream {
     socket.onclose = ({ reason }) => void this.lost(socket, reason);
   }
 
-  /** Show a scan: its first view, or, where we hold it already, what is new. */
+  /** Show a scan: its first view, or all that we hold of it already. */
   open(scan: string): void {
     this.wanted = scan;
     if (this.looking) this.answer(this.looking, 'superseded', null);
     this.looking = null;
+    this.unseen = true;
     if (this.node) this.sendOpen();
   }
 
@@ -99,8 +102,7 @@ export class Stream {
   restore(): void {
     this.work = this.work.then(() => {
       if (!this.model?.complete) return;
-      this.tellSnapshot(this.model, false);
-      if (this.model.hasTexels) this.tellAllTexels(this.model);
+      this.tellAll();
       this.tell({ kind: 'restored' });
     });
   }
@@ -118,7 +120,7 @@ export class Stream {
       case 'serverInfo':
         if (said.protocol !== PROTOCOL) throw new RemoteWireError(`the node speaks ${said.protocol}, this page ${PROTOCOL}`);
         this.node = { name: said.name, version: said.version };
-        this.say({ type: 'hello', protocol: PROTOCOL, client: CLIENT, codecs: ['htj2k', 'jpeg'] });
+        this.say({ type: 'hello', protocol: PROTOCOL, client: CLIENT, codecs: ['htj2k', 'jpeg'], geometries: ['cylinder', 'sphere'] });
         break;
       case 'welcome':
         this.attempt = 0;
@@ -162,6 +164,7 @@ export class Stream {
     if (this.model?.complete && this.model.info.id === scan.id) {
       this.model.resume(epoch);
       this.wanted = scan.id;
+      if (this.unseen) this.tellAll();
       if (this.looking) this.sendLook();
       return;
     }
@@ -206,7 +209,7 @@ export class Stream {
   private firstView(model: Model): void {
     if (!model.complete) return;
     this.acknowledge(model);
-    this.tellSnapshot(model, true);
+    this.tellAll();
     if (this.looking) this.sendLook();
   }
 
@@ -300,11 +303,16 @@ export class Stream {
     this.tell({ kind: 'link', link });
   }
 
-  private tellSnapshot(model: Model, fresh: boolean): void {
+  /** All that we hold of a scan whose first view is in. */
+  private tellAll(): void {
+    const model = this.model!;
     this.patches = []; // the snapshot has them
     const [range, texture] = CHANNELS.map((channel) => model.holdings.channels[channel].level.slice());
     const snapshot = { info: model.info, steps: model.steps.slice(), coarseTexels: model.coarseTexels.slice(), levels: [range!, texture!] } as Snapshot;
-    this.tell({ kind: 'opened', snapshot, fresh }, [snapshot.steps.buffer as ArrayBuffer, snapshot.coarseTexels.buffer as ArrayBuffer]);
+    const buffers = [snapshot.steps.buffer as ArrayBuffer, snapshot.coarseTexels.buffer as ArrayBuffer];
+    this.tell({ kind: 'opened', snapshot, fresh: this.unseen }, buffers);
+    this.unseen = false;
+    if (model.hasTexels) this.tellAllTexels(model);
   }
 
   private tellAllTexels(model: Model): void {

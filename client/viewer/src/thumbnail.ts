@@ -11,21 +11,24 @@ export function drawThumbnail(
 ): Uint8ClampedArray<ArrayBuffer> {
   const { coarseWidth: w, coarseHeight: h, coarseTextureWidth: tw, coarseTextureHeight: th } = info;
   const side = THUMBNAIL_SIDE;
-  const heightMm = info.height * info.pitchMm;
+  const sphere = info.geometry === 'sphere';
   const reach = steps.reduce((most, step) => Math.max(most, step), 1) * info.stepMm;
+  const heightMm = sphere ? 2 * reach : info.height * info.pitchMm;
   const scale = (side * MARGIN) / Math.max(heightMm, 2 * reach);
   const pixels = new Uint8ClampedArray(4 * side * side);
   const depth = new Float32Array(side * side).fill(-Infinity);
   for (let row = 0; row < th; row++) {
     const r = Math.floor((row * h) / th);
-    const y = Math.round(side / 2 + ((row + 0.5) / th - 0.5) * heightMm * scale);
+    const share = (row + 0.5) / th;
+    const [flat, up] = sphere ? [Math.sin(Math.PI * share), Math.cos(Math.PI * share)] : [1, 0];
     for (let column = 0; column < tw; column++) {
       const c = Math.floor((column * w) / tw);
       const radius = steps[r * w + c]! * info.stepMm;
       const angle = info.theta0Rad + (2 * Math.PI * (column + 0.5)) / tw - facing;
-      const near = radius * Math.cos(angle);
+      const near = radius * flat * Math.cos(angle);
       if (radius === 0 || near < 0) continue;
-      const x = Math.round(side / 2 + radius * Math.sin(angle) * scale);
+      const x = Math.round(side / 2 + radius * flat * Math.sin(angle) * scale);
+      const y = Math.round(side / 2 - (sphere ? radius * up : (0.5 - share) * heightMm) * scale);
       const shade = 0.45 + 0.6 * slopeLight(steps, r, c, w, angle);
       const [from, at] = [4 * (row * tw + column), y * side + x];
       for (const pixel of [at, at + 1, at + side, at + side + 1]) {

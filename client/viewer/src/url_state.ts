@@ -1,7 +1,7 @@
 // What the page's address holds, so that a link reproduces a view: scan, camera, foveae, pins.
 
 import type { CameraPlace } from './view/stage.ts';
-import type { Place } from './view/pick.ts';
+import type { Place } from './view/room.ts';
 
 export interface Pin extends Place {
   label: string;

@@ -12,7 +12,8 @@ const INFO = {
   coarseTextureWidth: 90, coarseTextureHeight: 50, stepMm: 0.01, pitchMm: 1, zMaxMm: 100, theta0Rad: 0.3,
 };
 const TILE = 64;
-const cylinder = (radiusMm: number) => new Uint16Array(INFO.width * INFO.height).fill(radiusMm / INFO.stepMm);
+const SPHERE = { ...INFO, geometry: 'sphere' as const };
+const alike = (radiusMm: number) => new Uint16Array(INFO.width * INFO.height).fill(radiusMm / INFO.stepMm);
 
 test('an address holds a view, and nonsense in it is left out', () => {
   const state = {
@@ -31,7 +32,7 @@ test('waits grow from half a second to eight', () => {
 });
 
 test('what is picked is where it is drawn', () => {
-  const steps = cylinder(50);
+  const steps = alike(50);
   for (const place of [{ u: 0.1, v: 0.5 }, { u: 0.999, v: 0.2 }, { u: 0.002, v: 0.9 }]) {
     const point = locate(INFO, steps, place)!;
     const from = new Vector3(point.x * 6, point.y + 20, point.z * 6);
@@ -41,7 +42,7 @@ test('what is picked is where it is drawn', () => {
 });
 
 test('a void is looked through, on to the other side', () => {
-  const steps = cylinder(50);
+  const steps = alike(50);
   for (let row = 80; row < 120; row++) steps.fill(0, row * INFO.width, row * INFO.width + 40);
   const inVoid = { u: 20 / 360, v: 0.5 };
   assert.equal(locate(INFO, steps, inVoid), null);
@@ -51,15 +52,54 @@ test('a void is looked through, on to the other side', () => {
   assert.ok(Math.abs(picked.u - (inVoid.u + 0.5)) < 1e-3);
 });
 
+test('a sphere is picked where it is drawn, its poles too, from any side', () => {
+  // A ball whose centre is not the grid's: it slopes at the poles, and columns differ there.
+  const steps = alike(0).map((_, at) => {
+    const [angle, polar] = [2 * Math.PI * ((at % 360) + 0.5) / 360 + SPHERE.theta0Rad, Math.PI * (Math.floor(at / 360) + 0.5) / 200];
+    return Math.round((50 + 8 * Math.sin(polar) * Math.cos(angle)) / INFO.stepMm);
+  });
+  for (const place of [{ u: 0.1, v: 0.5 }, { u: 0.999, v: 0.003 }, { u: 0.4, v: 0 }, { u: 0.002, v: 0.9999 }]) {
+    const point = locate(SPHERE, steps, place)!;
+    const from = point.clone().sub(new Vector3(0, SPHERE.zMaxMm, 0)).multiplyScalar(4).add(new Vector3(20, SPHERE.zMaxMm + 9, 5));
+    const picked = pick(SPHERE, steps, new Ray(from, point.clone().sub(from).normalize()))!;
+    assert.ok(picked.u >= 0 && picked.u < 1 && picked.v >= 0 && picked.v < 1);
+    assert.ok(locate(SPHERE, steps, picked)!.distanceTo(point) < 0.02, JSON.stringify([place, picked]));
+  }
+});
+
+test('across a pole, and across the seam, nothing jumps', () => {
+  const steps = alike(0).map((_, at) => 5000 + Math.round(100 * Math.cos((2 * Math.PI * ((at % 360) + 0.5)) / 360)));
+  const along = (places: { u: number; v: number }[]) => places.map((place) => locate(SPHERE, steps, place)!);
+  const [before, after] = along([{ u: 0.25, v: 1e-6 }, { u: 0.75, v: 1e-6 }]);
+  assert.ok(before!.distanceTo(after!) < 0.01);
+  const [left, right] = along([{ u: 1 - 1e-6, v: 0.4 }, { u: 1e-6, v: 0.4 }]);
+  assert.ok(left!.distanceTo(right!) < 0.01);
+});
+
+test('a sphere is closed over its poles by a fan for each tile beside them', () => {
+  const tiles = new Tiles(SPHERE, TILE);
+  tiles.update(alike(50), new Uint8Array(45 * 25));
+  const camera = new PerspectiveCamera(120, 1, 1, 1000);
+  camera.position.set(0, SPHERE.zMaxMm, 120);
+  camera.updateMatrixWorld();
+  const { batches } = tiles.choose(camera, 700, { cellPx: 1, trianglesMax: 1e6, tileSide: TILE });
+  const fans = batches.flatMap(({ fans }) => fans.filter((_, at) => at % 2 === 0).map((column, at) => `${column} ${fans[2 * at + 1]}`));
+  const columns = Array.from({ length: Math.ceil(INFO.width / TILE) }, (_, at) => at * TILE);
+  assert.deepEqual(fans.sort(), columns.flatMap((column) => [`${column} 0`, `${column} 1`]).sort());
+});
+
 test('everything fits the picture, however narrow', () => {
-  const bounds = boundsOf(INFO, cylinder(50));
+  const bounds = boundsOf(INFO, alike(50));
   assert.deepEqual([bounds.bottomMm, bounds.topMm], [-100, 100]);
+  const ball = boundsOf(SPHERE, alike(50));
+  assert.deepEqual([ball.bottomMm, ball.topMm], [50, 150]);
+  assert.ok(Math.abs(ball.radiusMm - 50) < 0.01);
   assert.ok(fittingDistance(bounds, 0.4) > fittingDistance(bounds, 2));
 });
 
 test('neighbouring tiles share every vertex of their border', () => {
   const tiles = new Tiles(INFO, TILE);
-  tiles.update(cylinder(50), new Uint8Array(45 * 25).map((_, block) => (block % 45 < 24 ? 0 : 6)));
+  tiles.update(alike(50), new Uint8Array(45 * 25).map((_, block) => (block % 45 < 24 ? 0 : 6)));
   const camera = new PerspectiveCamera(28, 1, 1, 1000);
   camera.position.set(-500, 0, 0);
   camera.lookAt(0, 0, 0);

@@ -20,6 +20,10 @@ export interface ChannelShape {
   height: number;
   coarseWidth: number;
   coarseHeight: number;
+  /** Rows are polar angles; near the poles they hold fewer samples of their own (rings.ts). */
+  sphere?: boolean;
+  /** Of a strip of such rows: how many columns apart these samples stand; 1 if it is not said. */
+  stride?: number;
 }
 
 /** What travels of a lattice. */
@@ -59,6 +63,11 @@ export interface Lattice {
 
 export const blockSide = (shape: ChannelShape): number => (shape.channel === RANGE ? 8 : 16);
 export const blocksAcross = (shape: ChannelShape): number => Math.ceil(shape.width / blockSide(shape));
+/** How many columns apart the samples stand that a row holds itself, and how many of them it has. */
+export const strideOf = (shape: ChannelShape): number => shape.stride ?? 1;
+export const ownWidth = (shape: ChannelShape): number => shape.width / strideOf(shape);
+/** How many own samples right of a block its cells hang on: the next one, where there are cells between. */
+export const beyond = (shape: ChannelShape): number => (strideOf(shape) > 1 ? 1 : 0);
 export const blocksDown = (shape: ChannelShape): number => Math.ceil(shape.height / blockSide(shape));
 
 /** Level of a block that holds nothing but the first view. */
@@ -95,16 +104,20 @@ export function skirtSteps(halfSpacing: number, rho: number, coarseSpacing: numb
 
 /** Compute a lattice from what travelled. Throws RemoteWireError when the parameters describe none. */
 export function buildLattice(shape: ChannelShape, p: Parameters): Lattice {
-  check(shape, p);
-  const x = axisX(shape, p);
-  const y = axisY(shape, p);
+  checkParameters(shape, p);
+  return latticeOf(shape, p, axisX(shape, p), axisY(shape, p));
+}
+
+/** The lattice over two axes. */
+export function latticeOf(shape: ChannelShape, p: Parameters, x: Axis, y: Axis): Lattice {
   const [levelX, levelY] = [x.gap.map(levelOfGap), y.gap.map(levelOfGap)];
   const level = new Uint8Array(levelX.length * levelY.length);
   levelY.forEach((ly, row) => levelX.forEach((lx, column) => (level[row * levelX.length + column] = Math.max(lx, ly))));
   return { shape, x, y, level, listed: listedBlocks(shape, p, x, y) };
 }
 
-function check(shape: ChannelShape, p: Parameters): void {
+/** Throws RemoteWireError unless the parameters describe a lattice. */
+export function checkParameters(shape: ChannelShape, p: Parameters): void {
   const [rows, columns] = [blocksDown(shape), blocksAcross(shape)];
   const rhoFits = (rho: number) => rho === 0 || (rho >= RHO_ONE && rho <= RHO_MAX);
   const divides = (2 * shape.width) % p.halfSpacing === 0;
@@ -118,19 +131,19 @@ function check(shape: ChannelShape, p: Parameters): void {
   if (!fits) throw new RemoteWireError(`no lattice: ${JSON.stringify(p)}`);
 }
 
-function axisX(shape: ChannelShape, p: Parameters): Axis {
-  const { width } = shape;
-  const [block, columns] = [blockSide(shape), blocksAcross(shape)];
+/** The x axis, in samples of a row's own. */
+export function axisX(shape: ChannelShape, p: Parameters): Axis {
+  const [width, block, columns] = [ownWidth(shape), blockSide(shape) / strideOf(shape), blocksAcross(shape)];
   if (p.blocksWide === columns) return ring(shape, p.halfSpacing);
   const end = p.blockX + p.blocksWide;
   const stop = end <= columns ? Math.min(end * block, width) : width + Math.min((end - columns) * block, width);
   const steps = halfSteps(shape, p.halfSpacing, p.rhoX, width, shape.coarseWidth);
   const border = growBoth(plateau(2 * p.blockX * block, 2 * stop, p.halfSpacing), steps, 2 * (width - 1));
   const at = positions(shape, border);
-  return cover(at, counting(at.length), border, turns(shape, [-1, 0, 1], false));
+  return cover(at, counting(at.length), border, turns(shape, [-1, 0, 1], false), beyond(shape));
 }
 
-function axisY(shape: ChannelShape, p: Parameters): Axis {
+export function axisY(shape: ChannelShape, p: Parameters): Axis {
   const { height } = shape;
   const block = blockSide(shape);
   const stop = Math.min((p.blockY + p.blocksHigh) * block, height);
@@ -152,7 +165,7 @@ function plateau(start: number, stop: number, halfSpacing: number): number[] {
 
 function halfSteps(shape: ChannelShape, halfSpacing: number, rho: number, size: number, coarse: number): number[] {
   const steps = skirtSteps(halfSpacing, rho, Math.max(1, Math.floor(size / coarse)), size).map((step) => 2 * step);
-  return shape.channel === TEXTURE && halfSpacing > 2 ? [halfSpacing, ...steps] : steps;
+  return shape.channel === TEXTURE && (halfSpacing > 2 || beyond(shape)) ? [halfSpacing, ...steps] : steps;
 }
 
 function growBoth(core: number[], steps: number[], span: number): number[] {
@@ -185,12 +198,12 @@ function positions(shape: ChannelShape, border: number[]): number[] {
 }
 
 function ring(shape: ChannelShape, halfSpacing: number): Axis {
-  let border = counting((2 * shape.width) / halfSpacing + 1).map((k) => k * halfSpacing);
+  let border = counting((2 * ownWidth(shape)) / halfSpacing + 1).map((k) => k * halfSpacing);
   let at = positions(shape, border);
   if (shape.channel === RANGE) [at, border] = [at.slice(0, -1), border.slice(0, -1)];
-  const [count, turn] = [at.length, QUARTERS * shape.width];
+  const [count, turn] = [at.length, QUARTERS * ownWidth(shape)];
   const sample = [count - 1, ...counting(count), 0];
-  return cover([at.at(-1)! - turn, ...at, at[0]! + turn], sample, border, turns(shape, [0], false));
+  return cover([at.at(-1)! - turn, ...at, at[0]! + turn], sample, border, turns(shape, [0], false), beyond(shape));
 }
 
 function repeatEdges(at: number[], shape: ChannelShape, border: number[]): [number[], number[]] {
@@ -211,8 +224,8 @@ interface Blocks {
 }
 
 function turns(shape: ChannelShape, offsets: number[], vertical: boolean): Blocks {
-  const size = vertical ? shape.height : shape.width;
-  const side = blockSide(shape);
+  const size = vertical ? shape.height : ownWidth(shape);
+  const side = blockSide(shape) / (vertical ? 1 : strideOf(shape));
   const all: Blocks = { block: [], start: [], stop: [] };
   for (const offset of offsets) {
     for (let index = 0; index < Math.ceil(size / side); index++) {
@@ -224,8 +237,11 @@ function turns(shape: ChannelShape, offsets: number[], vertical: boolean): Block
   return all;
 }
 
-/** Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches. */
-function cover(at: number[], sample: number[], border: number[], blocks: Blocks): Axis {
+/**
+ * Keep the blocks whose bilinear stencil lies inside the hull, with the widest interval each one touches.
+ * further: how many positions past the block the stencil reaches.
+ */
+function cover(at: number[], sample: number[], border: number[], blocks: Blocks, further = 0): Axis {
   const count = sample.reduce((most, one) => Math.max(most, one), 0) + 1;
   const axis: Axis = { at, sample, count, border, block: [], start: [], stop: [], gap: [], first: [], last: [] };
   const alone = (k: number) =>
@@ -234,7 +250,7 @@ function cover(at: number[], sample: number[], border: number[], blocks: Blocks)
   blocks.block.forEach((block, index) => {
     const [start, stop] = [blocks.start[index]!, blocks.stop[index]!];
     while (first + 1 < at.length && at[first + 1]! <= QUARTERS * start) first++;
-    while (last < at.length && at[last]! < QUARTERS * (stop - 1)) last++;
+    while (last < at.length && at[last]! < QUARTERS * (stop - 1 + further)) last++;
     if (first < 0 || last >= at.length) return;
     let gap = last > first ? 0 : alone(first);
     for (let k = first; k < last; k++) gap = Math.max(gap, at[k + 1]! - at[k]!);
@@ -264,7 +280,8 @@ function listedBlocks(shape: ChannelShape, p: Parameters, x: Axis, y: Axis): Uin
   return listed;
 }
 
-function runsToMask(runs: number[], size: number): Uint8Array {
+/** Run lengths, unlisted first, as a byte each. */
+export function runsToMask(runs: number[], size: number): Uint8Array {
   const mask = new Uint8Array(size);
   let at = 0;
   runs.forEach((run, index) => {

@@ -24,6 +24,7 @@ export interface ScanInfo {
   zMaxMm: number;
   theta0Rad: number;
   created?: string;
+  geometry?: 'cylinder' | 'sphere';
 }
 
 export interface Statement {
@@ -70,7 +71,7 @@ export interface Look {
 }
 
 export type FromClient =
-  | { type: 'hello'; protocol: string; client: string; codecs: string[] }
+  | { type: 'hello'; protocol: string; client: string; codecs: string[]; geometries: string[] }
   | { type: 'open'; request: number; scan: string; holdings?: Statement }
   | Look
   | { type: 'ack'; epoch: number; nextSeq: number; digest: string; applyMs: number }
@@ -91,6 +92,7 @@ const SCAN: Record<string, Check> = {
   id: isText, width: isSide, height: isSide, textureWidth: isSide, textureHeight: isSide,
   coarseWidth: isSide, coarseHeight: isSide, coarseTextureWidth: isSide, coarseTextureHeight: isSide,
   stepMm: isNumber, pitchMm: isNumber, zMaxMm: isNumber, theta0Rad: isNumber, created: optional(isText),
+  geometry: optional(oneOf('cylinder', 'sphere')),
 };
 const isScan: Check = (value) => typeof value === 'object' && value !== null && fits(value, SCAN) && isOrdered(value as ScanInfo);
 
@@ -139,13 +141,15 @@ function isOrdered(s: ScanInfo): boolean {
 
 /** Shapes of both channels of a scan. */
 export function channelShapes(s: ScanInfo): { [RANGE]: ChannelShape; [TEXTURE]: ChannelShape } {
+  const sphere = s.geometry === 'sphere';
   return {
     [RANGE]: {
       channel: RANGE, width: s.width, height: s.height, coarseWidth: s.coarseWidth, coarseHeight: s.coarseHeight,
+      sphere,
     },
     [TEXTURE]: {
       channel: TEXTURE, width: s.textureWidth, height: s.textureHeight,
-      coarseWidth: s.coarseTextureWidth, coarseHeight: s.coarseTextureHeight,
+      coarseWidth: s.coarseTextureWidth, coarseHeight: s.coarseTextureHeight, sphere,
     },
   };
 }

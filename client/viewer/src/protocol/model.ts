@@ -3,17 +3,18 @@
 
 import { HoldingsDiffer, RemoteWireError } from './errors.ts';
 import { Codecs } from './codec.ts';
-import { ChannelHoldings, hashBlock, Holdings, rankOf } from './holdings.ts';
-import { buildLattice, RANGE, TEXTURE } from './lattice.ts';
+import { ChannelHoldings, Holdings, rankOf } from './holdings.ts';
+import { RANGE, TEXTURE } from './lattice.ts';
 import type { Channel, ChannelShape } from './lattice.ts';
 import { channelShapes } from './messages.ts';
 import type { FromClient, ScanInfo, Statement } from './messages.ts';
 import {
-  coarseToRange, forEachAdopted, onlyFiner, paste, rangePatch, select, selectionSamples, spans, texturePatch,
+  coarseToRange, contentHashes, denseOf, onlyFiner, paste, rangePatch, spans, texturePatch,
 } from './reconstruct.ts';
-import type { Selection, Span } from './reconstruct.ts';
+import type { Chosen, Selection, Span } from './reconstruct.ts';
 import { COARSE } from './refinement.ts';
 import type { Refinement } from './refinement.ts';
+import { buildStrips, samplesOf, selectStrips, splitParts } from './strips.ts';
 
 const STATEMENTS_MAX = 3;
 
@@ -117,10 +118,11 @@ export class Model {
     rankOf(channel, quality);
     if (channel === RANGE) {
       const coarse = await codecs.range(payload, codec, height, width, quality);
-      await applyMask(coarse, refinement, codecs, height, width);
+      await applyMask(coarse, refinement.mask, codecs, height, width);
       this.coarseSteps = coarse;
       this.steps = coarseToRange(coarse, shape);
     } else {
+      if (refinement.mask.length) throw new RemoteWireError('texture has no voids of its own');
       this.coarseTexels = await codecs.texture(payload, codec, height, width, quality);
     }
     this.viewed.add(channel);
@@ -129,44 +131,41 @@ export class Model {
 
   private async applyFovea(refinement: Refinement, codecs: Codecs): Promise<Changed[]> {
     if (!this.complete) throw new RemoteWireError('a fovea before the first view');
-    const { channel, payload, codec, quality } = refinement;
+    const { channel, quality } = refinement;
     const rank = rankOf(channel, quality);
-    const { selection, adopted } = this.selected(refinement, rank);
-    const [rows, columns] = [selection.y.sample.length, selection.x.sample.length];
+    const strips = this.selected(refinement, rank);
     const changed = channel === RANGE
-      ? await this.pasteRange(selection, await codecs.range(payload, codec, rows, columns, quality), refinement, codecs)
-      : this.pasteTexture(selection, await codecs.texture(payload, codec, rows, columns, quality));
-    this.holdings.channels[channel].adopt(selection.lattice, adopted, rank);
+      ? this.pasteRange(strips, await rangePatches(refinement, strips, codecs))
+      : this.pasteTexture(strips, await texturePatches(refinement, strips, codecs));
+    for (const { selection, adopted } of strips) this.holdings.channels[channel].adopt(selection.lattice, adopted, rank);
     return changed;
   }
 
-  private selected(refinement: Refinement, rank: number): { selection: Selection; adopted: Uint8Array } {
+  private selected(refinement: Refinement, rank: number): Chosen[] {
     const { channel, parameters, samples, selfContained } = refinement;
     const held = this.holdings.channels[channel];
     const plannedOver = selfContained ? new ChannelHoldings(this.shapes[channel]) : held;
-    const chosen = select(buildLattice(this.shapes[channel], parameters!), plannedOver, rank);
-    const expected = chosen ? selectionSamples(chosen.selection) : 0;
-    if (!chosen || expected !== samples) throw new HoldingsDiffer(`${samples} samples, ${expected} expected`);
-    return selfContained ? onlyFiner(chosen, held, rank) : chosen;
+    const strips = selectStrips(buildStrips(this.shapes[channel], parameters!), plannedOver, rank);
+    const expected = samplesOf(strips);
+    if (!strips.length || expected !== samples) throw new HoldingsDiffer(`${samples} samples, ${expected} expected`);
+    return selfContained ? strips.map((strip) => onlyFiner(strip, held, rank)) : strips;
   }
 
-  private async pasteRange(
-    selection: Selection, samples: Uint16Array, refinement: Refinement, codecs: Codecs,
-  ): Promise<Changed[]> {
-    const patch = rangePatch(selection, samples);
-    const columns = selection.x.low.length;
-    await applyMask(patch, refinement, codecs, selection.y.low.length, columns);
-    paste(this.steps, patch, selection);
-    forEachAdopted(selection, ({ row, column, height, wide, block }) => {
-      this.holdings.addContent(block, hashBlock(patch, row * columns + column, columns, wide, height));
+  private pasteRange(strips: Chosen[], patches: Uint16Array[]): Changed[] {
+    return strips.flatMap(({ selection }, index) => {
+      const rectangle = denseOf(patches[index]!, selection, 1);
+      paste(this.steps, rectangle, selection);
+      for (const [block, hash] of contentHashes(rectangle, selection)) this.holdings.addContent(block, hash);
+      return this.cut(this.steps, selection);
     });
-    return this.cut(this.steps, selection);
   }
 
-  private pasteTexture(selection: Selection, samples: Uint8Array): Changed[] {
-    const patch = texturePatch(selection, samples);
-    paste(this.texels, new Uint32Array(patch.buffer), selection);
-    return this.cut(this.texels, selection);
+  private pasteTexture(strips: Chosen[], patches: Uint8Array[]): Changed[] {
+    return strips.flatMap(({ selection }, index) => {
+      const rectangle = denseOf(patches[index]!, selection, 4);
+      paste(this.texels, new Uint32Array(rectangle.buffer), selection);
+      return this.cut(this.texels, selection);
+    });
   }
 
   private cut(dense: Uint16Array | Uint32Array, selection: Selection): Changed[] {
@@ -182,11 +181,30 @@ export class Model {
   }
 }
 
-async function applyMask(
-  steps: Uint16Array, { mask, channel }: Refinement, codecs: Codecs, height: number, width: number,
-): Promise<void> {
+/** What goes into each strip, voids included. */
+async function rangePatches({ payload, mask, codec, quality }: Refinement, strips: Chosen[], codecs: Codecs): Promise<Uint16Array[]> {
+  const [payloads, masks] = [payload, mask].map((data) => splitParts(data, strips.length));
+  return Promise.all(strips.map(async ({ selection }, index) => {
+    const { x, y } = selection;
+    const samples = await codecs.range(payloads![index]!, codec, y.sample.length, x.sample.length, quality);
+    const patch = rangePatch(selection, samples);
+    await applyMask(patch, masks![index]!, codecs, y.low.length, x.low.length);
+    return patch;
+  }));
+}
+
+/** The same of texture. */
+async function texturePatches({ payload, mask, codec, quality }: Refinement, strips: Chosen[], codecs: Codecs): Promise<Uint8Array[]> {
+  if (mask.length) throw new RemoteWireError('texture has no voids of its own');
+  const payloads = splitParts(payload, strips.length);
+  return Promise.all(strips.map(async ({ selection }, index) => {
+    const { x, y } = selection;
+    return texturePatch(selection, await codecs.texture(payloads[index]!, codec, y.sample.length, x.sample.length, quality));
+  }));
+}
+
+async function applyMask(steps: Uint16Array, mask: Uint8Array, codecs: Codecs, height: number, width: number): Promise<void> {
   if (mask.length === 0) return;
-  if (channel === TEXTURE) throw new RemoteWireError('texture has no voids of its own');
   const voids = await codecs.mask(mask, height, width);
   voids.forEach((isVoid, index) => {
     if (isVoid) steps[index] = 0;

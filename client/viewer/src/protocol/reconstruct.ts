@@ -2,13 +2,16 @@
 // Range is interpolated exactly, so that every client gets the same grid; texture to within half a grey level.
 
 import { RemoteWireError } from './errors.ts';
-import { blocksAcross, QUARTERS } from './lattice.ts';
+import { beyond, blocksAcross, QUARTERS, strideOf } from './lattice.ts';
 import type { Axis, ChannelShape, Lattice } from './lattice.ts';
+import { hashBlock } from './holdings.ts';
 import type { ChannelHoldings } from './holdings.ts';
+import { widened } from './rings.ts';
 
 /**
  * One axis of a selection: the run of covered blocks round the adopted ones, and the samples they need.
- * low, high: for each dense position the two transmitted samples beside it; part / whole: its place between them.
+ * Positions are a row's own samples: all of them but on a sphere, and there, where cells lie between, one more than the
+ * blocks hold. low, high: for each position the two transmitted samples beside it; part / whole: its place between them.
  */
 export interface Window {
   block: number[];
@@ -38,12 +41,18 @@ export interface Span {
   source: number;
 }
 
+/** A selection, and the blocks that it is adopted in over its whole lattice. */
+export interface Chosen {
+  selection: Selection;
+  adopted: Uint8Array;
+}
+
 export const selectionSamples = (s: Selection): number => s.y.sample.length * s.x.sample.length;
 
 /** What a refinement at `rank` would carry to a client that holds `held`; null when nothing would be adopted. */
 export function select(
   lattice: Lattice, held: ChannelHoldings, rank: number,
-): { selection: Selection; adopted: Uint8Array } | null {
+): Chosen | null {
   const adopted = held.adoptable(lattice, rank);
   const wide = lattice.x.block.length;
   let [top, bottom, left, right] = [Infinity, -1, Infinity, -1];
@@ -55,14 +64,14 @@ export function select(
   });
   if (bottom < 0) return null;
   const y = window(lattice.y, top, bottom + 1);
-  const x = window(lattice.x, left, right + 1);
+  const x = window(lattice.x, left, right + 1, beyond(lattice.shape));
   return { selection: { lattice, y, x, adopted: core(adopted, wide, top, bottom + 1, left, right + 1) }, adopted };
 }
 
 /** Of a selection planned over the first view alone, the blocks that make what we hold finer. */
 export function onlyFiner(
-  chosen: { selection: Selection; adopted: Uint8Array }, held: ChannelHoldings, rank: number,
-): { selection: Selection; adopted: Uint8Array } {
+  chosen: Chosen, held: ChannelHoldings, rank: number,
+): Chosen {
   const { lattice, x, y } = chosen.selection;
   const now = held.adoptable(lattice, rank);
   const adopted = chosen.adopted.map((yes, index) => yes & now[index]!);
@@ -81,14 +90,14 @@ function core(
   return part;
 }
 
-function window(axis: Axis, begin: number, end: number): Window {
+function window(axis: Axis, begin: number, end: number, further = 0): Window {
   const [beginAt, endAt] = [axis.first[begin]!, axis.last[end - 1]! + 1];
   const at = axis.at.slice(beginAt, endAt);
   const sample = [...new Set(axis.sample.slice(beginAt, endAt))].sort((a, b) => a - b);
   const place = new Map(sample.map((number, index) => [number, index]));
   const local = axis.sample.slice(beginAt, endAt).map((number) => place.get(number)!);
   const start = axis.start[begin]!;
-  const cells = axis.stop[end - 1]! - start;
+  const cells = axis.stop[end - 1]! + further - start;
   const table = () => new Int32Array(cells);
   const [low, high, part, whole] = [table(), table(), table(), table().fill(1)];
   if (at.length > 1) {
@@ -191,13 +200,22 @@ function copyCells(samples: Uint8Array, y: Window, x: Window): Uint8Array {
   return new Uint8Array(patch.buffer);
 }
 
+/** Dense columns of the windows' rectangle. */
+const denseColumns = ({ lattice: { shape }, x }: Selection): number => (x.low.length - beyond(shape)) * strideOf(shape);
+
+/** A patch of own samples with the cells between them: the windows' rectangle. parts: values of a sample. */
+export function denseOf<T extends Uint16Array | Uint8Array>(patch: T, selection: Selection, parts: number): T {
+  return widened(patch, selection.x.low.length, strideOf(selection.lattice.shape), parts);
+}
+
 /** Where the windows' rectangle lies in the dense grid, cut at the seam. */
-export function spans({ lattice, y, x }: Selection): Span[] {
-  const { width } = lattice.shape;
+export function spans(selection: Selection): Span[] {
+  const { lattice: { shape }, y, x } = selection;
+  const [{ width }, all, stride] = [shape, denseColumns(selection), strideOf(shape)];
   const parts: Span[] = [];
-  for (let done = 0; done < x.low.length; ) {
-    const column = (((x.start + done) % width) + width) % width;
-    const run = Math.min(x.low.length - done, width - column);
+  for (let done = 0; done < all; ) {
+    const column = (((x.start * stride + done) % width) + width) % width;
+    const run = Math.min(all - done, width - column);
     parts.push({ x: column, y: y.start, width: run, height: y.low.length, source: done });
     done += run;
   }
@@ -206,14 +224,15 @@ export function spans({ lattice, y, x }: Selection): Span[] {
 
 type Cells = Uint16Array | Uint32Array;
 
-/** Overwrite the adopted blocks of a dense array with a patch; every other cell stays as it is. */
-export function paste<T extends Cells>(dense: T, patch: T, selection: Selection): void {
-  const { width } = selection.lattice.shape;
+/** Overwrite the adopted blocks of a dense array with the windows' rectangle; every other cell stays as it is. */
+export function paste<T extends Cells>(dense: T, rectangle: T, selection: Selection): void {
+  const { lattice: { shape }, x, y } = selection;
+  const [{ width }, across] = [shape, denseColumns(selection)];
   forEachAdopted(selection, ({ row, column, height, wide }) => {
-    const start = (((selection.x.start + column) % width) + width) % width;
+    const start = (((x.start * strideOf(shape) + column) % width) + width) % width;
     for (let r = row; r < row + height; r++) {
-      const from = r * selection.x.low.length + column;
-      dense.set(patch.subarray(from, from + wide) as never, (selection.y.start + r) * width + start);
+      const from = r * across + column;
+      dense.set(rectangle.subarray(from, from + wide) as never, (y.start + r) * width + start);
     }
   });
 }
@@ -230,17 +249,27 @@ export interface AdoptedBlock {
 /** Every adopted block, row by row. No block crosses the seam: the last one is cut there. */
 export function forEachAdopted(selection: Selection, visit: (block: AdoptedBlock) => void): void {
   const { y, x, adopted, lattice } = selection;
-  const columns = blocksAcross(lattice.shape);
+  const [columns, stride] = [blocksAcross(lattice.shape), strideOf(lattice.shape)];
   let [row, index] = [0, 0];
   y.block.forEach((by, j) => {
     let column = 0;
     x.block.forEach((bx, i) => {
-      const [height, wide] = [y.size[j]!, x.size[i]!];
+      const [height, wide] = [y.size[j]!, x.size[i]! * stride];
       if (adopted[index++]) visit({ row, column, height, wide, block: by * columns + bx });
       column += wide;
     });
     row += y.size[j]!;
   });
+}
+
+/** Hashes of the adopted blocks of a dense range rectangle, with their flat indices. */
+export function contentHashes(rectangle: Uint16Array, selection: Selection): [block: number, hash: number][] {
+  const across = denseColumns(selection);
+  const hashes: [number, number][] = [];
+  forEachAdopted(selection, ({ row, column, height, wide, block }) => {
+    hashes.push([block, hashBlock(rectangle, row * across + column, across, wide, height)]);
+  });
+  return hashes;
 }
 
 interface Between {

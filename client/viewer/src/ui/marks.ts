@@ -1,6 +1,6 @@
 import { strings } from '../strings.ts';
 import type { Pin } from '../url_state.ts';
-import type { Place } from '../view/pick.ts';
+import type { Place } from '../view/room.ts';
 import type { Stage } from '../view/stage.ts';
 import { h, refill } from './dom.ts';
 

@@ -1,6 +1,6 @@
 import { strings } from '../strings.ts';
 import type { Pin } from '../url_state.ts';
-import type { Place } from '../view/pick.ts';
+import type { Place } from '../view/room.ts';
 import { h, refill, section } from './dom.ts';
 
 /** The pins of a scan as a list, and the label of a new one. */

@@ -1,7 +1,7 @@
-// Where the camera stands when nobody has moved it, and how a scan's cylinder lies in the room: y is up.
+// Where the camera stands when nobody has moved it.
 
-import { Vector3 } from 'three';
 import type { ScanInfo } from '../protocol/messages.ts';
+import { isSphere } from './room.ts';
 
 export const FIELD_OF_VIEW_DEG = 28;
 const MARGIN = 1.08;
@@ -12,29 +12,26 @@ export interface Bounds {
   topMm: number;
 }
 
-/** Largest radius and heights of what was measured. */
+/** How far from the axis, how low and how high something was measured. */
 export function boundsOf(info: ScanInfo, steps: Uint16Array): Bounds {
   const { width, height, stepMm, pitchMm, zMaxMm } = info;
-  let [most, top, bottom] = [0, height, -1];
+  const bounds = { radiusMm: 0, bottomMm: Infinity, topMm: -Infinity };
+  const polar = isSphere(info) ? Math.PI / height : 0;
   for (let row = 0; row < height; row++) {
-    let measured = false;
-    for (let at = row * width; at < (row + 1) * width; at++) {
-      if (steps[at]! > most) most = steps[at]!;
-      measured ||= steps[at] !== 0;
-    }
-    if (measured) [top, bottom] = [Math.min(top, row), row];
+    let most = 0;
+    for (let at = row * width; at < (row + 1) * width; at++) if (steps[at]! > most) most = steps[at]!;
+    if (!most) continue;
+    const reach = most * stepMm;
+    const [upper, lower] = [row, row + 1].map((edge) => zMaxMm + (polar ? reach * Math.cos(polar * edge) : -edge * pitchMm));
+    bounds.radiusMm = Math.max(bounds.radiusMm, polar ? reach * Math.sin(polar * (row + 0.5)) : reach);
+    bounds.topMm = Math.max(bounds.topMm, upper!);
+    bounds.bottomMm = Math.min(bounds.bottomMm, lower!);
   }
-  if (bottom < 0) return { radiusMm: 1, bottomMm: zMaxMm - height * pitchMm, topMm: zMaxMm };
-  return { radiusMm: most * stepMm, bottomMm: zMaxMm - (bottom + 1) * pitchMm, topMm: zMaxMm - top * pitchMm };
+  return bounds.radiusMm ? bounds : { radiusMm: 1, bottomMm: zMaxMm - height * pitchMm, topMm: zMaxMm };
 }
 
 /** Distance from which everything is in the picture. aspect: its width / its height. */
 export function fittingDistance({ radiusMm, bottomMm, topMm }: Bounds, aspect: number): number {
   const half = Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
   return MARGIN * (radiusMm + Math.max((topMm - bottomMm) / 2 / half, radiusMm / half / aspect));
-}
-
-/** A point of the surface. radius [mm], angle [rad, counter-clockwise from above], height [mm]. */
-export function pointAt(radiusMm: number, angleRad: number, heightMm: number): Vector3 {
-  return new Vector3(radiusMm * Math.cos(angleRad), heightMm, -radiusMm * Math.sin(angleRad));
 }

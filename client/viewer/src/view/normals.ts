@@ -4,15 +4,15 @@ import {
   BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, GLSL3, LinearFilter, Mesh, NoBlending, RepeatWrapping, Scene,
   ShaderMaterial, Vector2, WebGLRenderTarget,
 } from 'three';
-import type { DataTexture, IUniform, WebGLRenderer } from 'three';
+import type { DataTexture, WebGLRenderer } from 'three';
 import type { Changed } from '../protocol/model.ts';
 import { compile } from './compile.ts';
+import type { Uniforms } from './grid_mesh.ts';
 import { COPY_FRAGMENT, NORMALS_FRAGMENT, QUAD_VERTEX } from './shaders.ts';
 
 /** Differences of a normal reach this far beyond the samples that changed. */
 const REACH = 24;
 
-type Uniforms = Record<string, IUniform>;
 type Rectangle = Omit<Changed, 'cells'>;
 
 export class Normals {
@@ -77,11 +77,19 @@ export class Normals {
   }
 
   private draw({ x, y, width, height }: Rectangle): void {
-    const [left, right] = [Math.max(0, x - REACH), Math.min(this.width, x + width + REACH)];
     const [top, bottom] = [Math.max(0, y - REACH), Math.min(this.height, y + height + REACH)];
+    const reach = this.reachRound(top, bottom);
+    const [left, right] = [Math.max(0, x - reach), Math.min(this.width, x + width + reach)];
     this.render(this.pass, left, top, right, bottom);
-    if (left === 0) this.render(this.pass, Math.max(right, this.width + x - REACH), top, this.width, bottom);
-    if (right === this.width) this.render(this.pass, 0, top, Math.min(left, x + width + REACH - this.width), bottom);
+    if (left === 0) this.render(this.pass, Math.max(right, this.width + x - reach), top, this.width, bottom);
+    if (right === this.width) this.render(this.pass, 0, top, Math.min(left, x + width + reach - this.width), bottom);
+  }
+
+  /** The same round: on a sphere, columns of these rows are as narrow as the ring next to a pole is short. */
+  private reachRound(top: number, bottom: number): number {
+    if (!this.uniforms['uSphere']!.value) return REACH;
+    const ring = Math.min(Math.sin((Math.PI * top) / this.height), Math.sin((Math.PI * bottom) / this.height));
+    return Math.min(Math.ceil(REACH / Math.max(ring, 1e-6)), this.width);
   }
 
   dispose(): void {

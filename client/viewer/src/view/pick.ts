@@ -2,13 +2,8 @@
 
 import { Ray, Vector3 } from 'three';
 import type { ScanInfo } from '../protocol/messages.ts';
-import { pointAt } from './framing.ts';
-
-/** A place on the scan as clicks and pins name it, both in [0, 1). */
-export interface Place {
-  u: number;
-  v: number;
-}
+import { isSphere, placeOf, pointAt, stepsAt } from './room.ts';
+import type { Place } from './room.ts';
 
 const BISECTIONS = 24;
 
@@ -28,10 +23,9 @@ export function pick(info: ScanInfo, steps: Uint16Array, ray: Ray): Place | null
 }
 
 /** Where a place is in the room; null where nothing was measured. */
-export function locate(info: ScanInfo, steps: Uint16Array, { u, v }: Place): Vector3 | null {
-  const radius = radiusAt(info, steps, u * info.width - 0.5, v * info.height - 0.5);
-  if (radius === null) return null;
-  return pointAt(radius, info.theta0Rad + 2 * Math.PI * u, info.zMaxMm - v * info.height * info.pitchMm);
+export function locate(info: ScanInfo, steps: Uint16Array, place: Place): Vector3 | null {
+  const radius = radiusAt(info, steps, place);
+  return radius === null ? null : pointAt(info, place, radius);
 }
 
 function refine(info: ScanInfo, steps: Uint16Array, ray: Ray, from: number, to: number, positive: boolean): Place {
@@ -41,49 +35,42 @@ function refine(info: ScanInfo, steps: Uint16Array, ray: Ray, from: number, to: 
     if (now !== null && now > 0 === positive) from = middle;
     else to = middle;
   }
-  return placeOf(info, ray.at(to, new Vector3()));
+  const { u, v } = placeOf(info, ray.at(to, new Vector3()));
+  return { u, v: Math.min(Math.max(v, 0), 1 - 1e-9) };
 }
 
 /** How far a point stands off the surface, outward; null where nothing was measured. */
 function height(info: ScanInfo, steps: Uint16Array, point: Vector3): number | null {
-  const { u, v } = unwrapped(info, point);
-  if (v < 0 || v >= 1) return null;
-  const radius = radiusAt(info, steps, u * info.width - 0.5, v * info.height - 0.5);
-  return radius === null ? null : Math.hypot(point.x, point.z) - radius;
+  const place = placeOf(info, point);
+  if (place.v < 0 || (place.v >= 1 && !isSphere(info))) return null;
+  const radius = radiusAt(info, steps, place);
+  return radius === null ? null : place.radiusMm - radius;
 }
 
 /** Bilinear over the measured ones of four samples; null where the nearest one is void. */
-function radiusAt(info: ScanInfo, steps: Uint16Array, x: number, y: number): number | null {
+function radiusAt(info: ScanInfo, steps: Uint16Array, { u, v }: Place): number | null {
+  const [x, y] = [u * info.width - 0.5, v * info.height - 0.5];
   const [column, row] = [Math.floor(x), Math.floor(y)];
   const [right, down] = [x - column, y - row];
-  const at = (c: number, r: number) =>
-    steps[Math.min(Math.max(r, 0), info.height - 1) * info.width + ((c % info.width) + info.width) % info.width]!;
-  if (at(Math.round(x), Math.round(y)) === 0) return null;
+  if (stepsAt(info, steps, Math.round(x), Math.round(y)) === 0) return null;
   let [sum, weight] = [0, 0];
   for (const [dx, dy, share] of [
     [0, 0, (1 - right) * (1 - down)], [1, 0, right * (1 - down)], [0, 1, (1 - right) * down], [1, 1, right * down],
   ] as const) {
-    const value = at(column + dx, row + dy);
+    const value = stepsAt(info, steps, column + dx, row + dy);
     if (value) [sum, weight] = [sum + share * value, weight + share];
   }
   return weight > 0 ? (sum / weight) * info.stepMm : null;
 }
 
-function unwrapped(info: ScanInfo, point: Vector3): Place {
-  const turn = (Math.atan2(-point.z, point.x) - info.theta0Rad) / (2 * Math.PI);
-  return { u: turn - Math.floor(turn), v: (info.zMaxMm - point.y) / (info.height * info.pitchMm) };
-}
-
-function placeOf(info: ScanInfo, point: Vector3): Place {
-  const { u, v } = unwrapped(info, point);
-  return { u: u % 1, v: Math.min(Math.max(v, 0), 1 - 1e-9) };
-}
-
-/** The part of a ray inside the scan's cylinder. */
+/** The part of a ray inside the scan's cylinder or sphere. */
 function span(info: ScanInfo, steps: Uint16Array, ray: Ray): [number, number] | null {
   const radius = mostSteps(steps) * info.stepMm;
-  const { origin: o, direction: d } = ray;
-  const [a, b, c] = [d.x * d.x + d.z * d.z, o.x * d.x + o.z * d.z, o.x * o.x + o.z * o.z - radius * radius];
+  const all = isSphere(info) ? 1 : 0;
+  const [o, d] = [ray.origin.clone(), ray.direction.clone()];
+  o.y = all * (o.y - info.zMaxMm);
+  d.y *= all;
+  const [a, b, c] = [d.dot(d), o.dot(d), o.dot(o) - radius * radius];
   const root = b * b - a * c;
   if (root < 0 || a === 0) return null;
   const near = Math.max(0, (-b - Math.sqrt(root)) / a);

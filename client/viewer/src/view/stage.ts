@@ -9,7 +9,8 @@ import { FACING_RAD } from '../facing.ts';
 import { cardIsDone } from './compile.ts';
 import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
 import { locate, pick } from './pick.ts';
-import type { Place } from './pick.ts';
+import { isSphere } from './room.ts';
+import type { Place } from './room.ts';
 import { Surface } from './surface.ts';
 import type { Shading } from './surface.ts';
 import type { Detail } from './tiles.ts';
@@ -25,6 +26,7 @@ const PACE_MAX = 6;
 const LEISURE_MS = 300;
 const TURN_STEP_RAD = Math.PI / 24;
 const ZOOM_STEP = 1.2;
+const ELEVATION_MAX_RAD = 1.5;
 
 /** Where the camera stands: angles [rad], distance and target [mm]. */
 export interface CameraPlace {
@@ -173,11 +175,18 @@ export class Stage {
     };
   }
 
+  /** Turn the camera to the side where a place is; on a sphere above or below it, too. */
+  face({ u, v }: Place): void {
+    if (!this.surface) return;
+    const { info } = this.surface;
+    const elevation = isSphere(info) ? within(Math.PI * (0.5 - v)) : this.placed.elevation;
+    this.place({ ...this.placed, azimuth: info.theta0Rad + 2 * Math.PI * u, elevation });
+  }
+
   /** Turn the camera by steps round the scan and up. */
   turn(across: number, up: number): void {
     const now = this.placed;
-    const elevation = Math.min(Math.max(now.elevation + up * TURN_STEP_RAD, -1.5), 1.5);
-    this.place({ ...now, azimuth: now.azimuth + across * TURN_STEP_RAD, elevation });
+    this.place({ ...now, azimuth: now.azimuth + across * TURN_STEP_RAD, elevation: within(now.elevation + up * TURN_STEP_RAD) });
     this.settle();
   }
 
@@ -323,6 +332,9 @@ export class Stage {
     this.draw();
   }
 }
+
+/** An elevation that leaves no doubt which way is up. */
+const within = (elevation: number): number => Math.min(Math.max(elevation, -ELEVATION_MAX_RAD), ELEVATION_MAX_RAD);
 
 /** Whether the processor draws, because there is no graphics card. */
 function drawsInSoftware(context: WebGL2RenderingContext): boolean {

@@ -1,19 +1,20 @@
 // One scan on the graphics card: range, normals, colour and levels as textures, drawn in tiles.
 
 import {
-  BufferAttribute, ClampToEdgeWrapping, DataTexture, DoubleSide, DynamicDrawUsage, GLSL3, Group, InstancedBufferAttribute,
-  InstancedBufferGeometry, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, NoBlending, NoColorSpace,
+  ClampToEdgeWrapping, DataTexture, Group, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, NoColorSpace,
   RedIntegerFormat, RepeatWrapping, RGBAFormat, ShaderMaterial, UnsignedByteType, UnsignedShortType, Vector2, Vector3,
 } from 'three';
-import type { IUniform, PerspectiveCamera, Texture, WebGLRenderer } from 'three';
+import type { InstancedBufferGeometry, PerspectiveCamera, Texture, WebGLRenderer } from 'three';
 import type { Snapshot } from '../link.ts';
 import { RANGE, TEXTURE } from '../protocol/lattice.ts';
 import type { Channel } from '../protocol/lattice.ts';
 import type { ScanInfo } from '../protocol/messages.ts';
 import type { Changed } from '../protocol/model.ts';
 import { compile } from './compile.ts';
+import { fan, fill, gridMesh, tileGrid } from './grid_mesh.ts';
+import type { Uniforms } from './grid_mesh.ts';
 import { Normals } from './normals.ts';
-import { SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
+import { isSphere } from './room.ts';
 import { STRIDES, Tiles } from './tiles.ts';
 import type { Detail } from './tiles.ts';
 
@@ -22,8 +23,6 @@ export type Shading = (typeof SHADINGS)[number];
 const RANGE_BLOCK = 8;
 const TEXTURE_BLOCK = 16;
 
-type Uniforms = Record<string, IUniform>;
-
 export class Surface {
   readonly object = new Group();
   readonly steps: Uint16Array;
@@ -31,6 +30,8 @@ export class Surface {
   readonly shrunk: number;
   private readonly tiles: Tiles;
   private readonly meshes: Mesh<InstancedBufferGeometry, ShaderMaterial>[];
+  /** What closes a sphere over its poles. */
+  private readonly fans: Mesh<InstancedBufferGeometry, ShaderMaterial>[];
   private readonly range: DataTexture;
   private readonly levels: [range: DataTexture, texture: DataTexture];
   private readonly coarse: DataTexture;
@@ -57,13 +58,16 @@ export class Surface {
     this.uniforms = {
       uRange: { value: this.range }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
       uPitchMm: { value: info.pitchMm }, uZMaxMm: { value: info.zMaxMm }, uTheta0: { value: info.theta0Rad },
+      uSphere: { value: isSphere(info) }, uPoles: { value: new Vector2() },
       uTile: { value: tileSide }, uNormals: { value: null }, uCoarse: { value: this.coarse },
       uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
       uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
     };
     this.tiles = new Tiles(info, tileSide);
-    this.meshes = STRIDES.map((stride) => tileMesh(tileSide, stride, this.tiles.count, this.uniforms));
-    this.object.add(...this.meshes);
+    this.meshes = STRIDES.map((stride) => gridMesh(tileGrid(tileSide / stride), stride, this.tiles.count, this.uniforms));
+    this.fans = isSphere(info) ? STRIDES.map((stride) => gridMesh(fan(tileSide / stride), stride, 2 * this.tiles.across, this.uniforms, true)) : [];
+    this.object.add(...this.meshes, ...this.fans);
+    this.closePoles();
     this.tiles.update(this.steps, snapshot.levels[0]);
     this.normals = new Normals(renderer, width, height, this.uniforms, this.levels[0], spacingOf(snapshot.levels[0]));
   }
@@ -112,6 +116,7 @@ export class Surface {
     this.normals.drawDue();
     const { batches, triangles } = this.tiles.choose(camera, sidePx, detail);
     this.meshes.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.corners, batches[index]!.edges));
+    this.fans.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.fans, []));
     (this.uniforms['uKey']!.value as Vector3).set(-0.45, 0.55, 0.8).normalize().transformDirection(camera.matrixWorld);
     (this.uniforms['uFill']!.value as Vector3).set(0.8, 0.05, 0.45).normalize().transformDirection(camera.matrixWorld);
     return triangles;
@@ -120,7 +125,7 @@ export class Surface {
   dispose(): void {
     for (const texture of [this.range, ...this.levels, this.coarse, this.dense]) texture.dispose();
     this.normals.dispose();
-    for (const { geometry, material } of this.meshes) {
+    for (const { geometry, material } of [...this.meshes, ...this.fans]) {
       geometry.dispose();
       material.dispose();
     }
@@ -134,6 +139,7 @@ export class Surface {
       this.upload(integers(cells as Uint16Array, width, height, 'R16UI'), this.range, x, y);
       this.normals.change({ x, y, width, height });
     }
+    this.closePoles();
     this.tiles.update(this.steps, level);
   }
 
@@ -162,6 +168,16 @@ export class Surface {
   private upload(source: DataTexture, target: Texture, x: number, y: number): void {
     this.renderer.copyTextureToTexture(source, target, null, new Vector2(x, y));
     source.dispose();
+  }
+
+  /** The poles of a sphere stand as far out as the row next to them does in the mean. */
+  private closePoles(): void {
+    const { width, height } = this.info;
+    const poles = [0, height - 1].map((row) => {
+      const measured = this.steps.subarray(row * width, (row + 1) * width).filter((step) => step > 0);
+      return measured.reduce((sum, step) => sum + step, 0) / Math.max(measured.length, 1);
+    });
+    (this.uniforms['uPoles']!.value as Vector2).set(poles[0]!, poles[1]!);
   }
 }
 
@@ -200,48 +216,6 @@ function shrink(cells: Uint8Array, x: number, y: number, width: number, height: 
     }
   }
   return { cells: small, x: left, y: top, width: right - left + 1, height: bottom - top + 1 };
-}
-
-function tileMesh(side: number, stride: number, tiles: number, shared: Uniforms): Mesh<InstancedBufferGeometry, ShaderMaterial> {
-  const geometry = new InstancedBufferGeometry();
-  const { position, index } = tileGrid(side / stride);
-  geometry.setAttribute('position', position);
-  geometry.setIndex(index);
-  // Room for all tiles at once: three.js never takes notice of a larger buffer.
-  for (const [name, each] of [['tile', 2], ['edges', 4]] as const) {
-    geometry.setAttribute(name, new InstancedBufferAttribute(new Float32Array(tiles * each), each).setUsage(DynamicDrawUsage));
-  }
-  geometry.instanceCount = 0;
-  const material = new ShaderMaterial({
-    vertexShader: SURFACE_VERTEX, fragmentShader: SURFACE_FRAGMENT, glslVersion: GLSL3, side: DoubleSide, blending: NoBlending,
-    uniforms: { ...shared, uStride: { value: stride } },
-  });
-  const mesh = new Mesh(geometry, material);
-  mesh.frustumCulled = false;
-  return mesh;
-}
-
-function tileGrid(cells: number): { position: BufferAttribute; index: BufferAttribute } {
-  const side = cells + 1;
-  const position = new Float32Array(3 * side * side);
-  const index = new Uint16Array(6 * cells * cells);
-  for (let y = 0, at = 0; y < side; y++) for (let x = 0; x < side; x++, at += 3) position.set([x, y, 0], at);
-  for (let y = 0, at = 0; y < cells; y++) {
-    for (let x = 0; x < cells; x++, at += 6) {
-      const a = y * side + x;
-      index.set([a, a + side, a + 1, a + 1, a + side, a + side + 1], at);
-    }
-  }
-  return { position: new BufferAttribute(position, 3), index: new BufferAttribute(index, 1) };
-}
-
-function fill(geometry: InstancedBufferGeometry, corners: number[], edges: number[]): void {
-  geometry.instanceCount = corners.length / 2;
-  for (const [name, values] of [['tile', corners], ['edges', edges]] as const) {
-    const attribute = geometry.getAttribute(name) as InstancedBufferAttribute;
-    (attribute.array as Float32Array).set(values);
-    attribute.needsUpdate = values.length > 0;
-  }
 }
 
 /** Samples from one that is held to the next, where they are densest. level: twice the logarithm of that. */

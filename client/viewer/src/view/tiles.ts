@@ -3,7 +3,7 @@
 import type { PerspectiveCamera } from 'three';
 import { Frustum, Matrix4, Sphere, Vector3 } from 'three';
 import type { ScanInfo } from '../protocol/messages.ts';
-import { pointAt } from './framing.ts';
+import { isSphere, pointAt } from './room.ts';
 
 export const STRIDES = [1, 2, 4, 8, 16, 32] as const;
 const BLOCK = 8;
@@ -28,11 +28,13 @@ interface Tile {
 export interface Batch {
   corners: number[];
   edges: number[];
+  /** Of a sphere, what closes it over the poles: first column, and 0 above or 1 below. */
+  fans: number[];
 }
 
 export class Tiles {
   private readonly tiles: Tile[] = [];
-  private readonly across: number;
+  readonly across: number;
   private readonly down: number;
   private readonly stride: Int32Array;
   private readonly frustum = new Frustum();
@@ -55,7 +57,8 @@ export class Tiles {
 
   /** Look again where tiles lie and what they hold. level: of 8 x 8 blocks. */
   update(steps: Uint16Array, level: Uint8Array): void {
-    const { width, height, stepMm, pitchMm, zMaxMm, theta0Rad } = this.info;
+    const { width, height, stepMm, pitchMm } = this.info;
+    const sphere = isSphere(this.info);
     for (const tile of this.tiles) {
       const [columns, rows] = [Math.min(this.side, width - tile.column), Math.min(this.side, height - tile.row)];
       let [least, most] = [Infinity, 0];
@@ -66,9 +69,10 @@ export class Tiles {
         }
       }
       const radius = (most ? (least + most) / 2 : 0) * stepMm;
-      const angle = theta0Rad + (2 * Math.PI * (tile.column + columns / 2)) / width;
-      tile.centre.copy(pointAt(radius, angle, zMaxMm - (tile.row + rows / 2) * pitchMm));
-      const half = [(radius * Math.PI * columns) / width, (rows * pitchMm) / 2, most ? ((most - least) * stepMm) / 2 : 0];
+      const [u, v] = [(tile.column + columns / 2) / width, (tile.row + rows / 2) / height];
+      tile.centre.copy(pointAt(this.info, { u, v }, radius));
+      const rowMm = sphere ? (radius * Math.PI) / height : pitchMm;
+      const half = [(radius * Math.PI * columns) / width, (rows * rowMm) / 2, most ? ((most - least) * stepMm) / 2 : 0];
       tile.reachMm = most ? 1.3 * Math.hypot(...half) : 0;
       tile.finest = this.finest(tile, columns, rows, level);
     }
@@ -100,7 +104,7 @@ export class Tiles {
   }
 
   private batches(): Batch[] {
-    const batches: Batch[] = STRIDES.map(() => ({ corners: [], edges: [] }));
+    const batches: Batch[] = STRIDES.map(() => ({ corners: [], edges: [], fans: [] }));
     this.tiles.forEach((tile, index) => {
       const stride = this.stride[index]!;
       if (!stride) return;
@@ -113,6 +117,9 @@ export class Tiles {
       const batch = batches[Math.log2(stride)]!;
       batch.corners.push(tile.column, tile.row);
       batch.edges.push(beside(-1, 0), beside(1, 0), beside(0, -1), beside(0, 1));
+      if (!isSphere(this.info)) return;
+      if (y === 0) batch.fans.push(tile.column, 0);
+      if (y === this.down - 1) batch.fans.push(tile.column, 1);
     });
     return batches;
   }

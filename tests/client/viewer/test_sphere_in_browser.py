@@ -1,0 +1,190 @@
+"""Closed objects in the page: clicked like any other, and no pole or seam to be seen."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+from playwright.sync_api import Browser, Page, WebSocket, sync_playwright
+
+from client import connect
+from foveascan import started
+from tests.client.viewer.browser import blank, click, crop, launch, opened, psnr, wait_drawn, wait_updates
+from tests.client.viewer.closed_objects import CENTRE_MM, SIZE, STANDING, STEP_MM, TIPPED, bring, grid_of
+
+ABOVE = math.pi / 2 - 1e-4
+LOOK_FIELDS = {"window": "window", "textureDb": "texture_db", "rangeMm": "range_mm"}
+
+
+@dataclass(frozen=True)
+class Objects:
+    """A node with the object standing and tipped over; aside: a thread for what needs an event loop."""
+
+    url: str
+    standing: str
+    tipped: str
+    aside: Executor
+
+    def seen(self, scan: str, elevation: float, distance: float = 200.0) -> str:
+        """The address of a view from where theta_h is 0, and from so far up."""
+        return f"{self.url}/#scan={scan}&camera=0,{elevation},{distance},0,{CENTRE_MM},0"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        running = launch(playwright)
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Objects]:
+    folder = str(tmp_path_factory.mktemp("closed"))
+    serve = ["serve", "--library", folder, "--listen", "127.0.0.1:0", "--insecure", "--json"]
+    with ExitStack() as stack, ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
+        _, ready = stack.enter_context(started(*serve))
+        scans = [aside.submit(bring, ready["url"], turn).result() for turn in (STANDING, TIPPED)]
+        yield Objects(ready["url"], *scans, aside)
+
+
+def test_clicks_all_over_leave_page_client_and_node_agreed(browser: Browser, objects: Objects) -> None:
+    spoken: list[dict[str, Any]] = []
+    with blank(browser) as (page, problems):
+        page.on("websocket", lambda socket: overhear(socket, spoken))
+        page.goto(f"{objects.url}/#scan={objects.standing}")
+        page.wait_for_selector("html[data-scan]", state="attached")
+        page.locator("#view").focus()
+        for number, keys in enumerate((["ArrowUp"] * 12, ["ArrowDown"] * 3, ["ArrowDown"] * 21, ["ArrowUp"] * 10), 1):
+            for key in (*keys, "ArrowRight", "Enter"):
+                page.keyboard.press(key)
+            wait_updates(page, number)
+    assert problems == []
+    assert not [said for said in spoken if said["type"] in ("resync", "state")]
+    looks = [said for said in spoken if said["type"] == "look"]
+    digests = [said["digest"] for said in spoken if said["type"] == "ack"][-len(looks):]
+    assert [min(look["v"], 1 - look["v"]) < 0.05 for look in looks] == [True, False, True, False]
+    assert digests == objects.aside.submit(digests_in_python, objects, looks).result()
+
+
+def overhear(socket: WebSocket, spoken: list[dict[str, Any]]) -> None:
+    """Note the control messages of both sides."""
+    for event in ("framesent", "framereceived"):
+        socket.on(event, lambda frame: spoken.append(json.loads(frame)) if isinstance(frame, str) else None)
+
+
+def digests_in_python(objects: Objects, looks: list[dict[str, Any]]) -> list[str]:
+    """What the Python client holds after each of the page's looks."""
+
+    async def follow() -> list[str]:
+        async with connect(objects.url) as session:
+            model = await session.open(objects.standing)
+            digests = []
+            for look in looks:
+                await session.look(look["u"], look["v"], **{ours: look[name] for name, ours in LOOK_FIELDS.items()})
+                digests.append(model.digest())
+            return digests
+
+    return asyncio.run(follow())
+
+
+@pytest.mark.parametrize("surface", ["flat", "relief"])
+def test_a_pole_looks_as_the_same_place_does_elsewhere(browser: Browser, objects: Objects, surface: str) -> None:
+    pictures = []
+    for scan, elevation in ((objects.standing, 0.0), (objects.tipped, ABOVE)):
+        with opened(browser, objects.seen(scan, elevation)) as page:
+            shade(page, surface)
+            before = crop(page, 0.5, 0.5, 300)
+            exactly(page)
+            click(page, 0.5, 0.5)
+            wait_updates(page, 1)
+            page.mouse.move(2, 2)
+            wait_drawn(page)
+            pictures.append([picture - picture.mean() for picture in (before, crop(page, 0.5, 0.5, 150))])
+    (coarse, fine), (coarse_pole, fine_pole) = pictures  # less their mean, as the light from the sky differs
+    print(psnr(coarse, coarse_pole), psnr(fine, fine_pole))
+    assert psnr(coarse, coarse_pole) >= 24
+    assert psnr(fine, fine_pole) >= 34
+
+
+def test_distances_over_a_pole_are_true(browser: Browser, objects: Objects) -> None:
+    with opened(browser, objects.seen(objects.standing, ABOVE)) as page:
+        exactly(page)
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        page.get_by_label("measures").check()
+        click(page, 0.45, 0.52)
+        click(page, 0.55, 0.47)
+        output = page.locator("output.distance")
+        shown_mm = float((output.text_content() or "").removesuffix(" mm"))
+        places = [tuple(map(float, place.split(","))) for place in (output.get_attribute("data-places") or "").split()]
+    assert all(v < 0.1 for _, v in places) and abs(places[0][0] - places[1][0]) > 0.25
+    assert shown_mm == pytest.approx(math.dist(*(point(*place) for place in places)), rel=0.01)
+    assert shown_mm > 8
+
+
+def test_a_pin_on_the_crown_is_shown_from_above(browser: Browser, objects: Objects) -> None:
+    with opened(browser, objects.seen(objects.tipped, ABOVE)) as page:
+        page.get_by_label("sets a pin").check()
+        click(page, 0.5, 0.5)
+        with page.expect_response(lambda answer: answer.request.method == "PATCH") as answered:
+            page.get_by_label("Label of the new pin").fill("crown")
+            page.keyboard.press("Enter")
+        assert answered.value.ok
+        page.locator("#view").focus()
+        page.keyboard.press("Home")
+        page.get_by_role("button", name="Show pin crown").click()
+        assert float(page.url.split("camera=")[1].split("%2C")[1]) > 1.4
+
+
+def test_an_exported_sphere_is_closed(browser: Browser, objects: Objects) -> None:
+    with opened(browser, objects.seen(objects.standing, 0.0)) as page:
+        page.locator("summary:has-text('This scan')").click()
+        with page.expect_download() as download:
+            page.get_by_role("link", name="STL").click()
+        mesh = trimesh.load(Path(download.value.path()), file_type="stl", force="mesh")
+    assert mesh.is_watertight and mesh.volume > 0
+
+
+def test_an_address_typed_anew_shows_the_same_scan_from_there(browser: Browser, objects: Objects) -> None:
+    with opened(browser, objects.seen(objects.standing, 0.0)) as page:
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        front = crop(page, 0.5, 0.5, 300)
+        page.goto(objects.seen(objects.standing, ABOVE))
+        page.wait_for_function("document.documentElement.dataset.looking === 'no'")
+        page.wait_for_url("**%2C1.5707%2C**")
+        wait_drawn(page)
+        assert psnr(crop(page, 0.5, 0.5, 300), front) < 25
+        click(page, 0.5, 0.5)
+        wait_updates(page, 2)
+
+
+def exactly(page: Page) -> None:
+    """Ask the next click for every sample of a wider window."""
+    page.get_by_label("Quality", exact=True).select_option("exact")
+
+
+def shade(page: Page, surface: str) -> None:
+    """Choose how the surface is drawn."""
+    page.get_by_label("Surface").evaluate("(one) => (one.closest('details').open = true)")
+    page.get_by_label("Surface").select_option(surface)
+    wait_drawn(page)
+
+
+def point(u: float, v: float) -> tuple[float, float, float]:
+    """Where the truth says that a place is. [mm]"""
+    steps = grid_of(STANDING).range_steps
+    radius_mm = float(steps[int(v * SIZE[1]), int(u * SIZE[0])]) * STEP_MM
+    polar, angle = math.pi * v, 2 * math.pi * u
+    level_mm = radius_mm * math.sin(polar)
+    return level_mm * math.cos(angle), level_mm * math.sin(angle), CENTRE_MM + radius_mm * math.cos(polar)
