@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from client.errors import HoldingsDiffer
 from client.model import Model, name_of, texture_of
-from protocol import codec_jpeg
+from protocol import codec_jpeg, sphere_fovea
 from protocol.bilinear import LightArray, blend, blend_colour, steps_with_holes, whole_steps
 from protocol.classic import (
     COARSE,
@@ -35,6 +35,8 @@ from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray, StepArray
 from protocol.lattice import Channel
 from protocol.messages import ScanInfo, Statement
 from protocol.refinement import Refinement
+from protocol.sphere import DirectionGrid, folded
+from protocol.sphere_fovea import SphereParameters, build_sphere_lattice
 
 
 class ClassicModel(Model):
@@ -104,8 +106,45 @@ class ClassicModel(Model):
             self.coarse_texture = texture_of(refinement, coarse_shape)
             self._texels = blend_colour(self.coarse_texture, y, x)
 
+    def directions(self, channel: Channel, parameters: SphereParameters) -> tuple[FloatArray, FloatArray]:
+        """The dense directions a spherical fovea samples: theta_v, theta_h (n,), in the order of its values. [rad]"""
+        shape = self.shapes[channel]
+        grid = DirectionGrid(shape.width, shape.height, self.spec.theta0_rad)
+        row, column = np.divmod(build_sphere_lattice(shape, parameters).sample, shape.width)
+        return folded(grid.theta_v(row), grid.theta_h(column))
+
+    def _apply_sphere(self, refinement: Refinement, parameters: SphereParameters) -> IntArray:
+        lattice = build_sphere_lattice(self.shapes[refinement.channel], parameters)
+        claimed = sphere_fovea.claim(lattice, self.foveae.on_sphere(refinement.channel))
+        kept = sphere_fovea.kept_samples(lattice, claimed)
+        cells, expected = lattice.cells[claimed], np.count_nonzero(kept)
+        if not expected or expected != refinement.samples:
+            raise HoldingsDiffer(f"{name_of(refinement)}: {refinement.samples} samples, {expected} expected")
+        if refinement.channel is Channel.RANGE:
+            values = np.full(lattice.sample.size, np.nan)
+            values[kept] = steps_with_holes(_raw_steps(refinement))
+            steps = lattice.blend(values)[claimed]
+            self._steps.reshape(-1)[cells] = whole_steps(steps)
+            self._fine_mm.reshape(-1)[cells] = self._to_mm(steps)
+            self._spacings.reshape(-1)[cells] = lattice.spacing[claimed] * lattice.shape.height / np.pi
+            self._owner.reshape(-1)[cells] = parameters.fovea
+            self._range_mm = None
+        else:
+            rows, columns = bounds(kept[lattice.node])
+            shape = rows.stop - rows.start, columns.stop - columns.start
+            texels = np.zeros((lattice.sample.size, 3))
+            texels[lattice.node[rows, columns]] = _jpeg_of(refinement, shape)
+            self._texels.reshape(-1, 3)[cells] = np.rint(lattice.blend(texels)[claimed]).astype(np.uint8)
+        steps_sent = refinement.payload if refinement.channel is Channel.RANGE else b""
+        self.foveae = self.foveae.adopt(lattice, claimed, steps_sent)
+        row, column = np.divmod(cells, lattice.shape.width)
+        side = lattice.shape.block
+        return np.unique(row // side * lattice.shape.blocks[1] + column // side)
+
     def _apply_fovea(self, refinement: Refinement) -> IntArray:
-        if not isinstance(refinement.parameters, ClassicParameters):
+        if isinstance(refinement.parameters, SphereParameters):
+            return self._apply_sphere(refinement, refinement.parameters)
+        if not isinstance(refinement.parameters, ClassicParameters) or self.spec.geometry == "sphere":
             raise RemoteWireError(f"{name_of(refinement)}: of another profile than the scan was opened with")
         lattice = build_classic(self.shapes[refinement.channel], refinement.parameters)
         claimed = claim(lattice, self.foveae.of(refinement.channel))
@@ -137,12 +176,10 @@ class ClassicModel(Model):
     def _take_texture(
         self, lattice: ClassicLattice, claimed: BoolArray, kept: BoolArray, refinement: Refinement
     ) -> None:
-        if refinement.mask or refinement.codec != TextureCodec.JPEG or not 1 <= refinement.quality <= 100:
-            raise CodecError(f"classic texture is a JPEG of Q 1..100, not codec {refinement.codec}")
         rows, columns = bounds(kept)
         shape = rows.stop - rows.start, columns.stop - columns.start
         texels = np.zeros((*kept.shape, 3), np.uint8)
-        texels[rows, columns] = codec_jpeg.decode(refinement.payload, shape, refinement.quality)
+        texels[rows, columns] = _jpeg_of(refinement, shape)
         _paste(self._texels, lattice, claimed, blend_colour(texels, *lattice.places()))
 
     def _to_mm(self, steps: FloatArray) -> LightArray:
@@ -156,6 +193,13 @@ def _raw_steps(refinement: Refinement) -> StepArray:
     if len(refinement.payload) != 2 * refinement.samples:
         raise CodecError(f"{refinement.samples} range values in {len(refinement.payload)} bytes")
     return np.frombuffer(refinement.payload, "<u2").astype(np.uint16)
+
+
+def _jpeg_of(refinement: Refinement, shape: tuple[int, int]) -> ImageArray:
+    """The image of a texture payload. shape + (3,) uint8"""
+    if refinement.mask or refinement.codec != TextureCodec.JPEG or not 1 <= refinement.quality <= 100:
+        raise CodecError(f"classic texture is a JPEG of Q 1..100, not codec {refinement.codec}")
+    return codec_jpeg.decode(refinement.payload, shape, refinement.quality)
 
 
 def _paste(dense: NDArray[np.generic], lattice: ClassicLattice, claimed: BoolArray, patch: NDArray[np.generic]) -> None:

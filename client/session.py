@@ -6,6 +6,7 @@ This half asks; client.reader takes the answers and keeps the model.
 from __future__ import annotations
 
 import asyncio
+import math
 import re
 import zlib
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
@@ -271,9 +272,19 @@ class Session:
 def _checked_look(look: m.Look) -> m.Look:
     try:
         plain = msgspec.to_builtins(look, enc_hook=float)  # numbers of numpy are numbers too
+        _require_finite(plain)
         return msgspec.convert(plain, m.Look)
     except (msgspec.ValidationError, TypeError, ValueError) as error:
         raise LocalWireError(f"look: {_plainly(str(error))}") from None
+
+
+def _require_finite(plain: Any, name: str = "") -> None:
+    """Raise ValueError for a number that is none, which passes every bound."""
+    if isinstance(plain, dict):
+        for key, value in plain.items():
+            _require_finite(value, key)
+    elif isinstance(plain, float) and not math.isfinite(plain):
+        raise ValueError(f"expected a finite number - at `$.{name}`")
 
 
 def _plainly(problem: str) -> str:

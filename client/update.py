@@ -9,11 +9,10 @@ from typing import Literal
 import numpy as np
 
 from client.model import Applied
-from protocol.classic import ClassicParameters
 from protocol.grid import IntArray
-from protocol.lattice import Channel, Parameters
+from protocol.lattice import Channel
 from protocol.messages import Updated
-from protocol.refinement import Refinement
+from protocol.refinement import AnyParameters, Refinement
 
 ChannelName = Literal["range", "texture"]
 
@@ -26,7 +25,7 @@ class Sent:
     """
 
     channel: ChannelName
-    parameters: Parameters | ClassicParameters
+    parameters: AnyParameters
     quality: int
     codec: int
     samples: int
@@ -34,7 +33,7 @@ class Sent:
 
     @property
     def p(self) -> float:
-        """Plateau spacing; classic: the first spacing beside the fovea, of the wider axis. [source samples]"""
+        """Plateau spacing; classic: the first beside the fovea, of the wider axis. [source samples, sphere: rad]"""
         return self.parameters.spacing
 
 

@@ -16,7 +16,6 @@ from node.library import Scan
 from protocol import codec_jpeg
 from protocol.bilinear import among_samples, blend, blend_colour, steps_with_holes, whole_steps, wrapped
 from protocol.classic import (
-    PARAMETERS,
     ClassicLattice,
     ClassicParameters,
     Foveae,
@@ -32,9 +31,10 @@ from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray, StepArray
 from protocol.lattice import Channel, ChannelShape, channel_shapes
 from protocol.messages import CodecName, ScanInfo
 from protocol.refinement import CRC, HEADER, Generator, Refinement
+from protocol.sphere_fovea import SphereLattice
 
 FIRST_VIEW_REFINEMENTS = 2
-OVERHEAD_BYTES = FRAME_BYTES + HEADER.size + PARAMETERS.size + CRC.size
+OVERHEAD_BYTES = FRAME_BYTES + HEADER.size + CRC.size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ class ClassicView:
 class ClassicCoded:
     """One fovea's samples in one channel, encoded.  quality : the JPEG's Q, or 1 for range."""
 
-    lattice: ClassicLattice
+    lattice: ClassicLattice | SphereLattice
     claimed: BoolArray
     samples: int
     codec: int
@@ -85,13 +85,14 @@ class ClassicCoded:
     @property
     def wire_bytes(self) -> int:
         """What it takes on the wire, carrier included."""
-        return OVERHEAD_BYTES + len(self.payload)
+        return OVERHEAD_BYTES + len(self.lattice.parameters.to_bytes()) + len(self.payload)
 
     def refinement(self, epoch: int, seq: int, look: int) -> Refinement:
         """The wire record."""
         channel = self.lattice.shape.channel
+        generator = Generator.SPHERE if isinstance(self.lattice, SphereLattice) else Generator.CLASSIC
         return Refinement(
-            Generator.CLASSIC, channel, epoch, seq, look, self.codec, self.quality, self.samples, self.payload,
+            generator, channel, epoch, seq, look, self.codec, self.quality, self.samples, self.payload,
             parameters=self.lattice.parameters,
         )  # fmt: skip
 

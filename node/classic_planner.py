@@ -13,7 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
+
 from node.classic import ClassicCoded, ClassicState, code_classic_range, code_classic_texture
+from node.classic_sphere import code_sphere, window_rings
 from node.foveate import REPLY_BYTES, Reason
 from node.library import Scan
 from protocol.classic import ClassicParameters, single
@@ -25,6 +28,7 @@ from protocol.messages import ClassicLookParameters, ClassicRange, ClassicTextur
 SCALE_MIN = 0.1  # one sample is all that is left of a fovea
 BISECTIONS = 8
 FOVEAE_MAX = 65535
+SHRINK, SHRINKS = 0.7, 16  # of the window of rings that take too many bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,10 @@ def plan_classic(
         raise LatticeError(f"{FOVEAE_MAX} foveae are all that one opening can tell apart: open the scan anew")
     state = replace(state, looks=state.looks + 1)
     left = math.inf if budget_bytes is None else budget_bytes - REPLY_BYTES
+    if scan.spec.geometry == "sphere":
+        return _plan_sphere(scan, state, look, left, superseded)
+    if look.classic is not None and look.classic.sphere is not None:
+        raise LatticeError("a cylinder has no directions: `sphere` goes with a spherical scan")
     search = _Search(scan, state, look, look.classic or _viewers_choice(look), left, superseded)
     try:
         coded = search.largest()
@@ -62,6 +70,25 @@ def plan_classic(
     for one in coded:
         state = replace(state, holdings=one.held_by(state.holdings))
     return ClassicUpdate(coded, state, "byte limit" if search.limited else "complete", encodes=search.encodes)
+
+
+def _plan_sphere(
+    scan: Scan, state: ClassicState, look: Look, left: float, superseded: Callable[[], bool]
+) -> ClassicUpdate:
+    """The lattice asked for, if it fits; rings over the window, or over as much of it as fits, where none is."""
+    wanted = look.classic or ClassicLookParameters(ClassicRange(), ClassicTexture())
+    for tries in range(SHRINKS):
+        if superseded():
+            return ClassicUpdate((), state, "superseded")
+        sphere = wanted.sphere or window_rings(look, SHRINK**tries)
+        coded = code_sphere(scan, state, look, msgspec.structs.replace(wanted, sphere=sphere))
+        if sum(one.wire_bytes for one in coded) <= left:
+            for one in coded:
+                state = replace(state, holdings=one.held_by(state.holdings))
+            return ClassicUpdate(coded, state, "byte limit" if tries else "complete", encodes=(tries + 1) * len(coded))
+        if wanted.sphere is not None:
+            break
+    return ClassicUpdate((), state, "byte limit")
 
 
 class _Superseded(Exception):

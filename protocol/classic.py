@@ -23,6 +23,7 @@ from protocol.errors import LatticeError, LocalWireError, RemoteWireError
 from protocol.fovea import cyclic_positions, fovea_table, open_positions, view_to_radius
 from protocol.grid import BoolArray, FloatArray, IntArray
 from protocol.lattice import Channel, ChannelShape
+from protocol.sphere_fovea import SphereLattice
 
 PARAMETERS = struct.Struct("<HHHffff")
 SAMPLES_MAX = 1 << 23
@@ -226,7 +227,7 @@ def bounds(kept: BoolArray) -> tuple[slice, slice]:
 class Held:
     """One refinement taken in: its lattice, and the checksums of everything up to it."""
 
-    lattice: ClassicLattice
+    lattice: ClassicLattice | SphereLattice
     crc: int
     content: int
 
@@ -239,9 +240,16 @@ class Foveae:
 
     def of(self, channel: Channel) -> list[ClassicLattice]:
         """Lattices of one channel, oldest first."""
+        return [one for one in self._all_of(channel) if isinstance(one, ClassicLattice)]
+
+    def on_sphere(self, channel: Channel) -> list[SphereLattice]:
+        """The same of a sphere."""
+        return [one for one in self._all_of(channel) if isinstance(one, SphereLattice)]
+
+    def _all_of(self, channel: Channel) -> list[ClassicLattice | SphereLattice]:
         return [one.lattice for one in self.held if one.lattice.shape.channel is channel]
 
-    def adopt(self, lattice: ClassicLattice, claimed: BoolArray, steps: bytes = b"") -> Foveae:
+    def adopt(self, lattice: ClassicLattice | SphereLattice, claimed: BoolArray, steps: bytes = b"") -> Foveae:
         """With one more refinement; steps: of range, its values as they travel raw."""
         last = self.held[-1] if self.held else Held(lattice, 0, 0)
         crc = zlib.crc32(lattice.parameters.to_bytes(), zlib.crc32(bytes([lattice.shape.channel]), last.crc))

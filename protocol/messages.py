@@ -160,11 +160,31 @@ class ClassicTexture(_Part, frozen=True):
     q: Annotated[int, Meta(ge=10, le=95)] = 75
 
 
+class ClassicSphere(_Part, frozen=True):
+    """Which directions a classic fovea samples on a sphere, the same in range and texture.
+
+    rings : circles spacing_rad apart up to cap_rad, then growing by the skirt's S' = s (null: no skirt).
+    literal, rotated : m rings down and n across at f(i) = (exp(i / s) - 1) / alpha. [rad]
+    """
+
+    lattice: Literal["rings", "literal", "rotated"] = "rings"
+    cap_rad: Annotated[float, Meta(ge=0, le=3.141592653589793)] = 0.45
+    spacing_rad: Annotated[float, Meta(ge=1e-5, le=3.141592653589793)] | None = None
+    m: Annotated[int, Meta(ge=0, le=1023)] = 8
+    n: Annotated[int, Meta(ge=0, le=1023)] = 8
+    alpha: Annotated[float, Meta(ge=1e-3, le=1e4)] = 1.0
+    s: Scale | None = None
+
+
 class ClassicLookParameters(_Part, frozen=True):
-    """Parameters of a look at a classic scan; a channel left out is not refined."""
+    """Parameters of a look at a classic scan; a channel left out is not refined.
+
+    On a sphere `sphere` says where samples stand (null: rings over the window); alpha, s and sigma are a cylinder's.
+    """
 
     range: ClassicRange | None = None
     texture: ClassicTexture | None = None
+    sphere: ClassicSphere | None = None
 
 
 # From the node

@@ -14,6 +14,7 @@ from enum import IntEnum
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
 from protocol.lattice import Channel, Parameters
+from protocol.sphere_fovea import SphereParameters
 
 MAGIC = 0x5246
 VERSION = 1
@@ -24,6 +25,7 @@ PARAMETERS_MAX = 4096
 MASK_MAX = 8 << 20
 PAYLOAD_MAX = 256 << 20
 VARINT_MAX = 5
+AnyParameters = Parameters | ClassicParameters | SphereParameters
 
 
 class Generator(IntEnum):
@@ -32,6 +34,7 @@ class Generator(IntEnum):
     COARSE = 0
     FOVEA = 1
     CLASSIC = 2
+    SPHERE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ class Refinement:
     samples: int
     payload: bytes = field(repr=False)
     mask: bytes = field(default=b"", repr=False)
-    parameters: Parameters | ClassicParameters | None = None
+    parameters: AnyParameters | None = None
     self_contained: bool = False
 
     def to_bytes(self) -> bytes:
@@ -91,17 +94,19 @@ class Refinement:
         )
 
 
-def _packed(parameters: Parameters | ClassicParameters | None) -> bytes:
-    if isinstance(parameters, ClassicParameters):
+def _packed(parameters: AnyParameters | None) -> bytes:
+    if isinstance(parameters, (ClassicParameters, SphereParameters)):
         return parameters.to_bytes()
     return b"" if parameters is None else pack_parameters(parameters)
 
 
-def _unpacked(generator: Generator, data: bytes) -> Parameters | ClassicParameters | None:
+def _unpacked(generator: Generator, data: bytes) -> AnyParameters | None:
     if bool(data) != (generator is not Generator.COARSE):
         raise RemoteWireError("a first view carries no lattice; everything else does")
     if generator is Generator.CLASSIC:
         return ClassicParameters.from_bytes(data)
+    if generator is Generator.SPHERE:
+        return SphereParameters.from_bytes(data)
     return unpack_parameters(data) if data else None
 
 

@@ -293,27 +293,36 @@ class Spread:
             raise LatticeError(f"f({self.count}) = {offsets[-1]:.3f} rad is beyond pi")
         return offsets
 
+    def both_ways(self) -> FloatArray:
+        """-f(count) .. 0 .. f(count), ascending. (2 count + 1,)"""
+        offsets = self.offsets()
+        return np.concatenate([-offsets[:0:-1], offsets])
 
-def literal_lattice(theta_v: float, theta_h: float, down: Spread, across: Spread) -> tuple[FloatArray, FloatArray]:
-    """The paper's set: (theta_v +- f(i), theta_h +- f(j)), i = 0..m, j = 0..n, folded, equal ones once. (k,) each
 
-    (2 m + 1)(2 n + 1) directions away from the poles; i = 0 and j = 0, which the paper leaves out, close the cross
-    through the fovea. Source: section 4, with F-17.
+def literal_nodes(theta_v: float, theta_h: float, down: Spread, across: Spread) -> tuple[FloatArray, FloatArray]:
+    """The paper's set: (theta_v +- f(i), theta_h +- f(j)), i = 0..m, j = 0..n, folded; (2 m + 1)(2 n + 1) each.
+
+    i = 0 and j = 0, which the paper leaves out, close the cross through the fovea. Source: section 4, with F-17.
     """
-    v, h = np.meshgrid(theta_v + _both_ways(down), theta_h + _both_ways(across), indexing="ij")
-    return _once(*folded(v.ravel(), h.ravel()))
+    v, h = np.meshgrid(theta_v + down.both_ways(), theta_h + across.both_ways(), indexing="ij")
+    return folded(v.ravel(), h.ravel())
 
 
-def rotated_lattice(theta_v: float, theta_h: float, down: Spread, across: Spread) -> tuple[FloatArray, FloatArray]:
-    """The literal lattice of a fovea on the equator, turned with the sphere until that stands at the direction."""
-    v, h = literal_lattice(np.pi / 2, 0.0, down, across)
+def rotated_nodes(theta_v: float, theta_h: float, down: Spread, across: Spread) -> tuple[FloatArray, FloatArray]:
+    """The literal set of a fovea on the equator, turned with the sphere until that stands at the direction."""
+    v, h = literal_nodes(np.pi / 2, 0.0, down, across)
     up = frame_at(np.pi / 2, 0.0)
     return directions(vectors(v, h) @ (frame_at(theta_v, theta_h) @ up.T).T)
 
 
-def _both_ways(spread: Spread) -> FloatArray:
-    offsets = spread.offsets()
-    return np.concatenate([-offsets[:0:-1], offsets])
+def literal_lattice(theta_v: float, theta_h: float, down: Spread, across: Spread) -> tuple[FloatArray, FloatArray]:
+    """The paper's set, equal directions once: as many away from the poles, fewer on them. (k,) each"""
+    return _once(*literal_nodes(theta_v, theta_h, down, across))
+
+
+def rotated_lattice(theta_v: float, theta_h: float, down: Spread, across: Spread) -> tuple[FloatArray, FloatArray]:
+    """The same, turned."""
+    return _once(*rotated_nodes(theta_v, theta_h, down, across))
 
 
 def _once(theta_v: FloatArray, theta_h: FloatArray) -> tuple[FloatArray, FloatArray]:

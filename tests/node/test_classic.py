@@ -15,7 +15,7 @@ from node.classic import (
     replicate_edges,
 )
 from node.library import Scan
-from protocol.classic import ClassicParameters, Foveae, build_classic, kept_samples, single
+from protocol.classic import ClassicLattice, ClassicParameters, Foveae, build_classic, kept_samples, single
 from protocol.codec import decode_texture
 from protocol.errors import LatticeError
 from protocol.grid import Grid, GridSpec
@@ -68,6 +68,7 @@ def test_depths_travel_alone_behind_a_short_header(scan: Scan, view: ClassicView
     assert len(wire) - len(coded.payload) == HEADER.size + 22 + CRC.size <= 64
     back = Refinement.from_bytes(wire)
     assert (back.parameters, back.samples) == (fovea(100, 40), coded.samples)
+    assert isinstance(coded.lattice, ClassicLattice)
     assert coded.samples == coded.lattice.x.size * coded.lattice.y.size
 
 
@@ -103,6 +104,7 @@ def test_a_second_fovea_sends_only_what_it_owns(scan: Scan, view: ClassicView) -
     alone = code_classic_range(scan, Foveae(), shape, fovea(110, 43, 2))
     assert second is not None and alone is not None
     assert second.samples < alone.samples
+    assert isinstance(second.lattice, ClassicLattice)
     kept = kept_samples(second.lattice, second.claimed)
     np.testing.assert_array_equal(values(second), values(alone)[kept.ravel()])
 

@@ -12,6 +12,7 @@ from node.classic import ClassicState, ClassicView, build_classic_view
 from node.classic_planner import FOVEAE_MAX, ClassicUpdate, plan_classic
 from node.foveate import REPLY_BYTES
 from node.library import Scan
+from protocol.classic import ClassicParameters
 from protocol.errors import LatticeError
 from protocol.fovea import finest_scale
 from protocol.lattice import Channel
@@ -95,16 +96,21 @@ def test_never_a_byte_over_and_more_detail_with_more(scan: Scan, view: ClassicVi
     assert (update.reason == "complete") == (wire_bytes(free) <= budget)
 
 
+def parameters_of(update: ClassicUpdate) -> list[ClassicParameters]:
+    found = [one.lattice.parameters for one in update.coded]
+    return [p for p in found if isinstance(p, ClassicParameters)]
+
+
 def test_without_a_budget_every_scale_is_the_finest(scan: Scan, view: ClassicView) -> None:
     update = plan_classic(scan, view.state, ask(alpha=0.5))
     assert update.reason == "complete" and update.encodes == 2
-    for one in update.coded:
-        assert one.lattice.parameters.s_x == pytest.approx(finest_scale(0.5), rel=1e-6)
+    for p in parameters_of(update):
+        assert p.s_x == pytest.approx(finest_scale(0.5), rel=1e-6)
 
 
 def test_mesh_and_texture_share_one_scale(scan: Scan, view: ClassicView) -> None:  # F-14: S and S/N
     update = plan_classic(scan, view.state, ask(alpha=0.05), 700)
-    mesh, texture = (one.lattice.parameters.s_x for one in update.coded)
+    mesh, texture = (p.s_x for p in parameters_of(update))
     assert update.reason == "byte limit" and texture == pytest.approx(4 * mesh, rel=1e-6)
 
 
@@ -118,8 +124,8 @@ def test_where_both_do_not_fit_the_mesh_goes_alone(scan: Scan, view: ClassicView
 
 def test_the_viewers_knobs_are_alpha_and_sigma(scan: Scan, view: ClassicView) -> None:
     update = plan_classic(scan, view.state, ask(alpha=0.5, scale=0.05))
-    for one in update.coded:
-        p, width = one.lattice.parameters, one.lattice.shape.width
+    for p, one in zip(parameters_of(update), update.coded, strict=True):
+        width = one.lattice.shape.width
         assert p.alpha_x == p.alpha_y == 0.5
         assert p.s_x == pytest.approx(0.05 * (width / 2) / np.log1p(0.25 * width), rel=1e-6)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from client import Model, connect
+from client import Model, RequestRefused, connect
 from client.transfer import send_scan
 from exchange.native import write_native
 from foveascan import started
@@ -25,6 +25,7 @@ from protocol.lattice import QUARTERS, Channel
 from protocol.messages import PROTOCOL, Hello, Open, Refused, decode_message, encode_message
 from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid, great_circle_rad, vectors
+from protocol.sphere_fovea import SphereParameters
 from protocol.strips import build_strips
 
 EXACT = {"range": {"p": 1, "quantum": 1}}
@@ -195,6 +196,54 @@ async def _errors_by_bytes(objects: Objects, name: str, place: tuple[float, floa
             error, weight = left_in_cap(model, true_mm, *place)
             found.append((update.payload_bytes, float(error @ weight / weight.sum())))
     return found
+
+
+async def test_the_papers_lattices_send_radial_values_only(objects: Objects) -> None:  # AT-16
+    async with connect(objects.url) as session:
+        for lattice, theta_v in itertools.product(("literal", "rotated"), (math.pi / 2, 0.3, 0.0)):
+            model = await session.open(objects.scans["knob"], profile="classic")
+            sphere = {"lattice": lattice, "m": 5, "n": 3, "alpha": 0.5, "s": 20.0}
+            update = await session.look_direction(theta_v, 1.0, parameters={"range": {}, "sphere": sphere})
+            (sent,) = update.parameters
+            assert isinstance(sent.parameters, SphereParameters)
+            at_v, at_h = model.directions(Channel.RANGE, sent.parameters)
+            assert len(at_v) == update.samples and update.payload_bytes == 2 * update.samples
+            assert update.samples == 11 * 7 - (6 if lattice == "literal" and theta_v == 0 else 0)
+            row, column = DirectionGrid(*SIZE[:2]).snap(at_v, at_h)
+            assert np.array_equal(model.range_steps[row, column], scan_of(*SCANS["knob"]).range_steps[row, column])
+            assert (model.owner[row, column] == 1).all() and 0 < (model.owner == 1).mean() < 0.2
+
+
+@pytest.mark.parametrize("theta_v", [0.0, 1.0, math.pi])
+async def test_rings_round_a_direction_by_the_classic_profile(objects: Objects, theta_v: float) -> None:
+    async with connect(objects.url) as session:
+        model = await session.open(objects.scans["knob"], profile="classic")
+        first = left_in_cap(model, knob_mm(dense(*SIZE[:2], UPRIGHT)), theta_v, 2.0)[0].mean()
+        update = await session.look_direction(theta_v, 2.0)
+        assert [sent.channel for sent in update.parameters] == ["range", "texture"]
+        assert left_in_cap(model, knob_mm(dense(*SIZE[:2], UPRIGHT)), theta_v, 2.0)[0].mean() < 0.7 * first
+        parameters = update.parameters[0].parameters
+        assert isinstance(parameters, SphereParameters)
+        at_v, at_h = model.directions(Channel.RANGE, parameters)
+        if theta_v in (0.0, math.pi):
+            counts = np.bincount((at_h // (math.pi / 2)).astype(int) % 4, minlength=4)
+            assert counts.max() - counts.min() <= 1  # AT-15
+        again = await session.look_direction(theta_v, 2.0)
+        assert again.samples == 0 and session.stats.resyncs == 0
+        little = await session.look_direction(math.pi - theta_v, 2.0, max_bytes=3000)
+        assert little.reason == "byte limit" and 0 < little.bytes_received <= 3000
+
+
+async def test_a_cylinder_and_a_sphere_keep_their_own_lattices(objects: Objects) -> None:
+    async with connect(objects.url) as session:
+        await session.open(objects.scans["knob"], profile="classic")
+        with pytest.raises(RequestRefused, match="sphere"):
+            await session.look_direction(1.0, 1.0, parameters={"range": {"s": 20.0}})
+        with pytest.raises(RequestRefused, match="beyond pi"):
+            sphere = {"lattice": "literal", "m": 1000, "alpha": 0.5, "s": 20.0}
+            await session.look_direction(1.0, 1.0, parameters={"range": {}, "sphere": sphere})
+        with pytest.raises(LocalWireError):
+            await session.look_direction(1.0, 1.0, parameters={"range": {}, "sphere": {"cap_rad": math.nan}})
 
 
 async def test_clicks_all_over_end_with_the_exact_scan(objects: Objects) -> None:
