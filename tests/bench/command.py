@@ -35,6 +35,8 @@ def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:
     """The scans asked for that are there, and why others are not. Raises ConfigError where none is."""
     from tests.bench.scans import STANDARD, Skipped, load
 
+    if args.name == "sphere":
+        return [], []  # it makes its own object, which it can tip over
     specimens = tuple(args.specimen or (("head",) if args.name in ("line", "capture", "page") else STANDARD))
     if args.texture and len(specimens) != 1:
         raise ConfigError("bench: --texture goes with one --specimen FILE")
@@ -93,6 +95,15 @@ def _rate(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     return record, rate.told(record)
 
 
+def _sphere(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import sphere
+
+    if args.specimen or args.size not in sphere.SIZES:
+        raise ConfigError(f"bench: sphere has an object of its own, at {' and '.join(sphere.SIZES)}")
+    record = sphere.run(args.size, args.repeats)
+    return record, sphere.told(record)
+
+
 def _alpha(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     from tests.bench import alpha
 
@@ -118,7 +129,7 @@ def _capture(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
 
 BENCHES: dict[str, Callable[[argparse.Namespace, list[BenchScan]], Told]] = {
     "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate, "alpha": _alpha, "page": _page,
-    "capture": _capture,
+    "capture": _capture, "sphere": _sphere,
 }  # fmt: skip
 
 

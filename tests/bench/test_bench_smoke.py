@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import foveascan
-from tests.bench import alpha, codec, line, page, rate, roi
+from tests.bench import alpha, codec, line, page, rate, roi, sphere
 from tests.bench.cache import Cache
 from tests.bench.rivals.offer import straight
 from tests.bench.scans import BenchScan, load
@@ -55,6 +55,15 @@ def test_the_page_is_measured_beside_an_empty_one(scan: BenchScan) -> None:
     assert record["click"]["count"]
     assert len(record["memory"]["mb"]["renderer process"]) == page.ROUNDS + 1
     assert page.told(record)
+
+
+def test_clicks_on_a_closed_object_reach_their_quality() -> None:
+    record = sphere.run("S", 1)
+    assert record["verified"]
+    assert {row["place"] for row in record["rows"]} == set(sphere.PLACES)
+    ours = max(row["bytes"] for row in record["rows"] if row["kind"] == "target")
+    assert sum(record["rival_bytes"].values()) > 5 * ours
+    assert "pole" in sphere.told(record)
 
 
 def test_an_image_is_most_similar_to_itself() -> None:
