@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import math
 from dataclasses import replace
+from functools import lru_cache
 from statistics import median
 from typing import Any
 
@@ -22,7 +23,7 @@ from client.model import Model
 from client.session import Session
 from protocol.grid import BoolArray, FloatArray, Grid, GridSpec
 from protocol.rings import thin_grid
-from protocol.sphere import DirectionGrid, click_of, great_circle_rad, sphere_faces, vectors
+from protocol.sphere import DirectionGrid, click_of, sphere_faces, vectors
 from tests.bench.ours import node_with, wire_bytes
 from tests.bench.scans import BenchScan
 from tests.bench.target import PERCENTILE, Target
@@ -114,13 +115,14 @@ def _left(model: Model, truth: Grid, theta_v: float, target: Target) -> tuple[fl
     return float(error[order][min(beyond, error.size - 1)]), 10 * math.log10(255**2 / max(mse, 1e-9))
 
 
+@lru_cache(maxsize=16)
 def _cap(shape: tuple[int, ...], theta_v: float, target: Target) -> tuple[BoolArray, FloatArray]:
     """Which directions of a dense grid lie in the window, and their solid angles. (H, W) bool, (n,)"""
     height, width = shape[:2]
     grid = DirectionGrid(width, height)
     row, column = np.mgrid[:height, :width]
-    away = great_circle_rad(vectors(grid.theta_v(row), grid.theta_h(column)), vectors(theta_v, 0.0))
-    inside = away <= math.acos(1 - 2 * target.window)
+    towards = vectors(grid.theta_v(row), grid.theta_h(column))
+    inside = towards @ vectors(theta_v, 0.0) >= 1 - 2 * target.window
     return inside, np.sin(grid.theta_v(row))[inside]
 
 
