@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -135,14 +136,25 @@ def _measured(part: Part, coded: Coded) -> Part:
     return replace(part, patch=texture_patch(part.selection, texels))
 
 
-def adopted_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, int]:
-    """Squared error that a measured refinement leaves in a region's adopted own texels, and of how many values."""
-    total, count = 0.0, 0
+def adopted_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, float]:
+    """Squared error that a measured refinement leaves in a region's adopted own texels, and of how many values.
+
+    On a sphere a value counts for the area it has, 1 on the equator.
+    """
+    total, count = 0.0, 0.0
     for part in coded.parts:
         if part.patch is not None:
             error, values = _patch_error(scan, part.selection, region, part.patch)
-            total, count = total + error, count + values
+            area = _area_of_value(part.selection)
+            total, count = total + area * error, count + area * values
     return total, count
+
+
+def _area_of_value(selection: Selection) -> float:
+    """How much area an own texel has in the middle of a strip, in texels of the equator."""
+    shape, y = selection.lattice.shape, selection.y
+    middle = y.start + y.low.size / 2
+    return shape.stride * math.sin(math.pi * middle / shape.height) if shape.sphere else 1.0
 
 
 def _patch_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, int]:
