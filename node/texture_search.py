@@ -228,7 +228,7 @@ class TextureSearch:
 
     def _error(self, coded: Coded | None) -> float:
         """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""
-        total, count = 0.0, 0
+        total, count = 0.0, 0.0
         if coded is not None:
             total, count = adopted_error(self._scan, coded, self._region)
         held_total, held_count = self._held_error(left_alone(self._state, coded, self._region))
