@@ -35,6 +35,7 @@ AWAY_S = 0.6
 PASSES = 4  # of M over USB: long enough to be measured
 POLL_S = 0.1
 SETTLED_S = 1.0
+WINDOW_S = 2.0  # in the middle of a sweep, in which the node is asked nothing
 
 
 @dataclass
@@ -98,16 +99,14 @@ async def _sweep(running: Line) -> tuple[float, int]:
         while (await session.scanner())["phase"] != "ready":
             await asyncio.sleep(POLL_S)
         await session.start_sweep()
-        first = last = (time.monotonic(), _cpu_s(running.pid))
-        while (status := await session.scanner())["phase"] in ("starting", "sweeping"):
-            if status["progress"] == 0:
-                first = (time.monotonic(), _cpu_s(running.pid))
-            elif status["progress"] < 1:
-                last = (time.monotonic(), _cpu_s(running.pid))
-            await asyncio.sleep(POLL_S)
+        await asyncio.sleep(SETTLED_S / 2)
+        first = time.monotonic(), _cpu_s(running.pid)
+        await asyncio.sleep(WINDOW_S)
+        last = time.monotonic(), _cpu_s(running.pid)
+        assert (await session.scanner())["phase"] == "sweeping"
         quality = await session.quality(await anext(published))
     assert quality is not None
-    return (last[1] - first[1]) / max(last[0] - first[0], 1e-9), quality.requested_columns
+    return (last[1] - first[1]) / (last[0] - first[0]), quality.requested_columns
 
 
 def driver(portion_bytes: int, repeats: int) -> dict[str, float]:
@@ -137,7 +136,7 @@ def _flood(bed: Any, data: bytes) -> None:
 def recovery(repeats: int) -> float:
     """From the plug's coming back to the first column that is sent again. [s]"""
     from protocol.framing import USB_PAYLOAD_MAX
-    from protocol.scanner_messages import RangeColumn, TextureColumn
+    from protocol.scanner_messages import Hello, RangeColumn, TextureColumn
     from simulators.carriers import serve
     from simulators.faults import FaultyScanner, parse_faults, split_frames
     from simulators.scanner import SimulatedScanner
@@ -154,11 +153,16 @@ def recovery(repeats: int) -> float:
 
     class Returning(FaultyScanner):
         columns_s: float | None = None
+        is_greeted = False
+
+        def receive_data(self, data: bytes, now_s: float) -> None:
+            is_back = bed.plugged_s is not None and bed.plugged_s > began_s
+            self.is_greeted |= is_back and any(frame[3] == Hello.TYPE for frame in split_frames(data))
+            super().receive_data(data, now_s)
 
         def data_to_send(self, max_bytes: int) -> bytes:
             data = super().data_to_send(max_bytes)
-            is_back = bed.plugged_s is not None and bed.plugged_s > began_s
-            if is_back and self.columns_s is None and any(frame[3] in COLUMNS for frame in split_frames(data)):
+            if self.is_greeted and self.columns_s is None and any(frame[3] in COLUMNS for frame in split_frames(data)):
                 self.columns_s = time.monotonic()
             return data
 

@@ -12,7 +12,6 @@ import asyncio
 import json
 import os
 import random
-import resource
 import signal
 import sys
 import threading
@@ -161,7 +160,9 @@ def assemble() -> None:
 
 
 def _peak_bytes() -> int:
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """The most that this process has had; ru_maxrss would begin with what its parent has."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.split("VmHWM:")[1].split()[0])
 
 
 JOBS: dict[str, Callable[..., None]] = {"device": device, "look": look, "read": read, "assemble": assemble}
