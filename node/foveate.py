@@ -145,6 +145,8 @@ class _Planner:
         aim, limit = self._left - range_bytes - self._spare / 2, self._left - RANGE_LEAST * range_bytes
         texture = self._texture.search(aim, limit)
         self._limited |= self._texture.limited
+        if texture is None:
+            self._spare /= 2  # range alone is coded so quickly that one more encode may fill it better
         for coded in self._fill_range(wanted, self._left - (texture.wire_bytes if texture else 0)):
             self._take(coded)
         self._take(texture)

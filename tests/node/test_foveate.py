@@ -232,6 +232,21 @@ def test_a_scan_that_is_all_void_is_served(tmp_path: Path) -> None:
     assert not viewer.model.range_steps.any()
 
 
+@pytest.mark.parametrize("budget", [None, 600, 2500])
+def test_a_click_on_a_void_is_served(scan: Scan, view: FirstView, budget: int | None) -> None:
+    row, column = np.argwhere(scan.range_steps == VOID)[0]
+    viewer = Viewer(scan, view)
+    look = Look(1, (column + 0.5) / scan.spec.width, (row + 0.5) / scan.spec.height)
+    viewer.take(plan_update(scan, viewer.state, look, "htj2k", budget))
+    assert budget or viewer.range_error_mm(look) <= look.range_mm
+
+
+def test_parameters_that_do_not_fit_a_limit_are_not_sent(scan: Scan, view: FirstView) -> None:
+    update = plan_update(scan, view.state, Look(1, 0.5, 0.5, parameters=EXACT), "htj2k", 800)
+    assert (update.reason, update.wire_bytes <= 800) == ("byte limit", True)
+    assert Channel.TEXTURE not in {coded.channel for coded in update.coded}
+
+
 def test_first_view_fits_and_is_the_same_for_the_node(scan: Scan) -> None:
     codecs: tuple[m.CodecName, ...] = "htj2k", "jpeg"
     for codec in codecs:

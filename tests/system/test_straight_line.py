@@ -186,6 +186,34 @@ async def test_never_a_byte_over_the_limit(head_node: RunningNode, max_bytes: in
                 assert update.reason == "byte limit"
 
 
+async def test_the_joint_choice_beats_a_fixed_quality_at_five_budgets(head_node: RunningNode) -> None:  # AT-38
+    click, fixed = head_node.truth.clicks(1)[0], 36
+    gains = []
+    async with connect(head_node.url) as session:
+        await session.open()
+        await surveyed(head_node.url)
+        whole = (await session.look(*click, texture_db=44)).bytes_received
+        for share in (0.3, 0.45, 0.6, 0.75, 0.9):
+            budget = round(share * whole)
+            model = await session.open()
+            update = await session.look(*click, texture_db=44, max_bytes=budget)
+            assert update.bytes_received <= budget
+            ours_db = head_node.truth.compare(model, *click)["texture_psnr_db"]
+            ranges = [sent for sent in update.parameters if sent.channel == "range"]
+            same_range = {"p": int(ranges[0].p), "quantum": ranges[0].quality}
+            for p in (1, 2, 4, 8):  # the finest that fits
+                model = await session.open()
+                held_db = head_node.truth.compare(model, *click)["texture_psnr_db"]
+                parameters = {"range": same_range, "texture": {"p": p, "quality": fixed}}
+                update = await session.look(*click, max_bytes=budget, parameters=parameters)
+                if len(update.parameters) == 2:
+                    held_db = head_node.truth.compare(model, *click)["texture_psnr_db"]
+                    break
+            gains.append(ours_db - held_db)
+    assert min(gains) >= -0.2
+    assert np.mean(gains) > 0
+
+
 async def test_a_click_outside_the_scan_is_refused_and_the_session_goes_on(head_node: RunningNode) -> None:
     async with connect(head_node.url) as session:
         await session.open()
@@ -214,6 +242,13 @@ async def test_real_scans_at_s(name: str, line: Callable[..., RunningNode]) -> N
             assert compared["ok"], compared
             assert_untouched_outside(update, before, model)
             assert_sample_nearest_click(update, model, node, u, v)
+
+
+async def surveyed(url: str) -> None:
+    """Returns once the node has measured the textures of what is open: until then it guesses."""
+    async with aiohttp.ClientSession() as http:
+        while (await (await http.get(f"{url}/v1/node")).json())["surveying"]:
+            await asyncio.sleep(0.05)
 
 
 @asynccontextmanager
