@@ -147,7 +147,6 @@ class NodeServer:
         for line in self._connections.values():
             line.abort()
         await self.derivation.stop()
-        await self.derivation.stop()
         self.audit.note("stopped", NODE)
         await self._runner.cleanup()
 
