@@ -57,6 +57,7 @@ def _looks(browser: Browser, node: RunningNode) -> None:
         page.keyboard.press("Enter")
         wait_updates(page, 2)
         page.locator("#received").scroll_into_view_if_needed()
+        page.wait_for_selector(".uplot")
         _take(page, "near")
 
 

@@ -20,6 +20,7 @@ export class CostPanel {
   private total = 0;
   private counted = 0;
   private inView = false;
+  private ticked = false;
 
   constructor() {
     const { cost } = strings;
@@ -29,7 +30,7 @@ export class CostPanel {
       h('figure', {}, h('figcaption', {}, cost.chartQuality), this.charts[1]),
     );
     setInterval(() => this.tick(), 1000);
-    new IntersectionObserver(([entry]) => (this.inView = entry!.isIntersecting)).observe(this.charts[0]);
+    new IntersectionObserver(([entry]) => this.seen(entry!.isIntersecting)).observe(this.charts[0]);
     new ResizeObserver(() => this.resize()).observe(this.charts[0]);
   }
 
@@ -47,7 +48,14 @@ export class CostPanel {
     if (this.qualities.length > ANSWERS_MAX) this.qualities.shift();
   }
 
+  /** Charts are drawn while they are in view; not before the first second is over, which belongs to the picture. */
+  private seen(inView: boolean): void {
+    this.inView = inView;
+    if (inView && this.ticked) this.draw();
+  }
+
   private tick(): void {
+    this.ticked = true;
     this.perSecond.shift();
     this.perSecond.push((this.total - this.counted) / 1000);
     this.counted = this.total;
