@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from enum import Enum
 
 from protocol.errors import LocalWireError, RemoteWireError
 from protocol.framing import (
@@ -32,6 +31,18 @@ from protocol.framing import (
     Frame,
     FrameReader,
     encode_frame,
+)
+from protocol.scanner_events import (
+    Accepted,
+    Command,
+    DeviceCommand,
+    Event,
+    HostCommand,
+    Refused,
+    Role,
+    Sent,
+    Unanswered,
+    WrongVersion,
 )
 from protocol.scanner_messages import (
     COLUMN_OVERHEAD,
@@ -64,6 +75,11 @@ from protocol.scanner_messages import (
     is_known,
 )
 
+__all__ = [
+    "Accepted", "Command", "DeviceCommand", "Event", "HostCommand", "Refused", "Role", "ScannerLink", "Sent",
+    "Unanswered", "WrongVersion",
+]  # fmt: skip
+
 TRIES = 5
 RETRY_MIN_S = 0.05
 RETRY_MAX_S = 3.2
@@ -72,61 +88,9 @@ _RETRY_GROWTH = 4.0  # five tries reach from the shortest wait to the longest
 _PARTIAL_MAX_S = 0.2  # a frame that pauses longer in the middle lost its rest
 _SEQ_MODULO = 2**32
 
-HostCommand = Hello | Reset | SweepRequest | Calibrate | SweepStart | SweepStop | RequestColumns
-DeviceCommand = Calibration | SweepHeader | SweepEnd | ColumnsGone | Fault
-Sent = HostCommand | DeviceCommand
-
 _HOST_COMMANDS = (Hello, Reset, SweepRequest, Calibrate, SweepStart, SweepStop, RequestColumns)
 _DEVICE_COMMANDS = (Calibration, SweepHeader, SweepEnd, ColumnsGone, Fault)
 _COLUMNS = (RangeColumn, TextureColumn)
-
-
-class Role(Enum):
-    """Which end of the link this is."""
-
-    HOST = "host"
-    DEVICE = "device"
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """The other end wants this done: `accept` or `refuse` it."""
-
-    seq: int
-    message: Sent
-
-
-@dataclass(frozen=True, slots=True)
-class Accepted:
-    """Our command was accepted."""
-
-    message: Sent
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """Our command was refused."""
-
-    message: Sent
-    code: NakCode
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Unanswered:
-    """Our command was sent five times and never answered."""
-
-    message: Sent
-
-
-@dataclass(frozen=True, slots=True)
-class WrongVersion:
-    """The other end speaks another major version; nothing but that can be understood."""
-
-    major: int
-
-
-Event = Command | Accepted | Refused | Unanswered | WrongVersion | Dropped | Hello | DeviceInfo | Status | Column
 
 
 @dataclass(slots=True)
