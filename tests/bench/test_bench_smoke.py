@@ -2,12 +2,13 @@
 
 import asyncio
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import foveascan
-from tests.bench import alpha, codec, line, page, rate, roi, sphere
+from tests.bench import alpha, codec, line, page, plots, rate, roi, sphere
 from tests.bench.cache import Cache
 from tests.bench.rivals.offer import straight
 from tests.bench.scans import BenchScan, load
@@ -24,6 +25,13 @@ def test_roi_compares_what_is_verified_with_what_is_verified(scan: BenchScan) ->
     assert record["verified"]
     assert record["rows"][0]["rivals"]["JPEG tile pyramid"]["size_bytes"] > 64
     assert "JPEG tile pyramid" in roi.told(record)
+
+
+def test_bytes_are_drawn_against_quality(scan: BenchScan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plots, "TARGETS", (Target(texture_db=36.0), Target(texture_db=40.0)))
+    monkeypatch.setattr(plots, "RIVALS", ("JPEG tile pyramid",))
+    (drawn,) = plots.draw([scan], "S", tmp_path / "plots", Cache(None))
+    assert drawn.read_bytes().startswith(b"\x89PNG")
 
 
 def test_line_measures_every_part(scan: BenchScan) -> None:
