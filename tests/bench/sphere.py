@@ -76,13 +76,14 @@ async def _looks(scans: dict[str, BenchScan], target: Target, repeats: int) -> l
     rows = []
     async with node_with(scans.values()) as (session, ids):
         for kind, more in (("target", {}), ("explicit", {"parameters": explicit})):
-            for place, (name, theta_v) in PLACES.items():
-                scan, looks = scans[name], []
-                for _ in range(repeats):
-                    looks.append(await _look(session, scan, ids[scan.key], theta_v, target, more))
-                row = looks[0] | {"kind": kind, "place": place}
-                row["node_ms"] = median(one["node_ms"] for one in looks)
-                rows.append(row)
+            looks: dict[str, list[dict[str, Any]]] = {place: [] for place in PLACES}
+            for _ in range(repeats):  # in turns, so that what else the machine does hits all alike
+                for place, (name, theta_v) in PLACES.items():
+                    scan = scans[name]
+                    looks[place].append(await _look(session, scan, ids[scan.key], theta_v, target, more))
+            for place, found in looks.items():
+                row = found[0] | {"kind": kind, "place": place}
+                rows.append(row | {"node_ms": median(one["node_ms"] for one in found)})
     return rows
 
 
