@@ -3,6 +3,7 @@ import { test } from 'node:test';
 import { PerspectiveCamera, Ray, Vector3 } from 'three';
 import { backoffMs } from '../src/backoff.ts';
 import { formatState, parseState } from '../src/url_state.ts';
+import { evened } from '../src/view/coarse_colours.ts';
 import { boundsOf, fittingDistance } from '../src/view/framing.ts';
 import { locate, pick } from '../src/view/pick.ts';
 import { STRIDES, Tiles } from '../src/view/tiles.ts';
@@ -86,6 +87,17 @@ test('a sphere is closed over its poles by a fan for each tile beside them', () 
   const fans = batches.flatMap(({ fans }) => fans.filter((_, at) => at % 2 === 0).map((column, at) => `${column} ${fans[2 * at + 1]}`));
   const columns = Array.from({ length: Math.ceil(INFO.width / TILE) }, (_, at) => at * TILE);
   assert.deepEqual(fans.sort(), columns.flatMap((column) => [`${column} 0`, `${column} 1`]).sort());
+});
+
+test('first colours of a sphere draw no star at a pole, and stay as they are elsewhere', () => {
+  const [width, height] = [64, 33];
+  const striped = Uint8Array.from({ length: 4 * width * height }, (_, at) => (at % 4 === 3 ? 255 : 200 * ((at >> 2) % 2)));
+  striped.fill(0, 0, 16); // void: four cells of the first row
+  const even = evened(striped, width, height);
+  const row = (index: number) => [...even.subarray(4 * index * width, 4 * (index + 1) * width)].filter((_, at) => at % 4 === 0);
+  for (const pole of [0, height - 1]) assert.ok(row(pole).every((value) => Math.abs(value - 100) <= 12), String(row(pole)));
+  assert.deepEqual(row(16), row(16).map((_, column) => 200 * (column % 2)));
+  assert.deepEqual([...even].filter((_, at) => at % 4 === 3), [...striped].filter((_, at) => at % 4 === 3));
 });
 
 test('everything fits the picture, however narrow', () => {

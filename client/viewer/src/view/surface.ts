@@ -10,6 +10,7 @@ import { RANGE, TEXTURE } from '../protocol/lattice.ts';
 import type { Channel } from '../protocol/lattice.ts';
 import type { ScanInfo } from '../protocol/messages.ts';
 import type { Changed } from '../protocol/model.ts';
+import { evened } from './coarse_colours.ts';
 import { compile } from './compile.ts';
 import { fan, fill, gridMesh, tileGrid } from './grid_mesh.ts';
 import type { Uniforms } from './grid_mesh.ts';
@@ -53,7 +54,9 @@ export class Surface {
       integers(snapshot.levels[0], Math.ceil(width / RANGE_BLOCK), Math.ceil(height / RANGE_BLOCK), 'R8UI'),
       integers(snapshot.levels[1], Math.ceil(info.textureWidth / TEXTURE_BLOCK), Math.ceil(info.textureHeight / TEXTURE_BLOCK), 'R8UI'),
     ];
-    this.coarse = colours(snapshot.coarseTexels, info.coarseTextureWidth, info.coarseTextureHeight);
+    const [coarseWidth, coarseHeight] = [info.coarseTextureWidth, info.coarseTextureHeight];
+    const coarse = isSphere(info) ? evened(snapshot.coarseTexels, coarseWidth, coarseHeight) : snapshot.coarseTexels;
+    this.coarse = colours(coarse, coarseWidth, coarseHeight);
     this.dense = colours(new Uint8Array(4), 1, 1);
     this.uniforms = {
       uRange: { value: this.range }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
