@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 import hatch_build
+from client.transfer import send_scan
+from exchange.native import write_native
+from foveascan import started
+from simulators.specimen import GENERATORS
 from tests.client.viewer.browser import click, launch, opened, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
 
@@ -36,12 +41,25 @@ def main() -> None:
         _tools(browser, node)
         _narrow(browser, node)
         _sweep(browser, node)
+        _pole(browser, stack.enter_context(_pebble(aside, folder / "closed")))
 
 
 @contextmanager
 def _browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         yield launch(playwright)
+
+
+@contextmanager
+def _pebble(aside: Executor, folder: Path) -> Iterator[str]:
+    """The address of a node with the closed specimen, as it is seen from inside."""
+    shape, file = (1440, 1024, 4096, 2048), io.BytesIO()
+    write_native(GENERATORS["pebble"](shape, 1), file, "pebble")
+    file.seek(0)
+    with started("serve", "--library", str(folder), "--listen", "127.0.0.1:0", "--insecure", "--json") as (_, ready):
+        sent = send_scan(ready["url"], file, moved=lambda done, total: None)
+        aside.submit(asyncio.run, sent).result()
+        yield ready["url"]
 
 
 def _looks(browser: Browser, node: RunningNode) -> None:
@@ -91,6 +109,18 @@ def _sweep(browser: Browser, node: RunningNode) -> None:
         wait_drawn(page)
         _take(page, "sweep")
         page.wait_for_selector('html[data-live="no"]', state="attached")
+
+
+def _pole(browser: Browser, url: str) -> None:
+    """From above, the upper pole somewhat over the middle of the picture: before and after a click on it."""
+    with opened(browser, url, viewport=WIDE) as page:
+        scan = page.evaluate("document.documentElement.dataset.scan")
+    with opened(browser, f"{url}/#scan={scan}&camera=0.3,1.3,220,0,47,0", viewport=WIDE) as page:
+        page.wait_for_timeout(1000)
+        _take(page, "pole_before")
+        click(page, 0.5, 0.37)
+        wait_updates(page, 1)
+        _take(page, "pole_after")
 
 
 def _take(page: Page, name: str) -> None:
