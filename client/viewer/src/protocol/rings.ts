@@ -24,18 +24,21 @@ export function ringStrides(width: number, height: number, side: number, halfSpa
  */
 export function widened<T extends Uint16Array | Uint8Array>(own: T, across: number, stride: number, parts: number): T {
   if (stride === 1) return own;
-  const rows = own.length / across / parts;
-  const cells = new (own.constructor as new (size: number) => T)(rows * (across - 1) * stride * parts);
+  const [columns, line] = [across - 1, across * parts];
+  const rows = own.length / line;
+  const cells = new (own.constructor as new (size: number) => T)(rows * columns * stride * parts);
+  const shift = Math.log2(stride) + 1; // divides by 2 t, a power of two
   let to = 0;
-  for (let row = 0; row < rows; row++) {
-    for (let from = row * across * parts; from < ((row + 1) * across - 1) * parts; from += parts) {
-      for (let k = 0; k < stride; k++) {
-        for (let part = from; part < from + parts; part++, to++) {
-          const [a, b] = [own[part]!, own[part + parts]!];
-          const isVoid = parts === 1 && k > 0 && (a === 0 || b === 0);
-          cells[to] = isVoid ? 0 : Math.floor((2 * (a * (stride - k) + b * k) + stride) / (2 * stride));
-        }
+  for (let row = 0, from = 0; row < rows; row++, from += parts) {
+    for (let column = 0; column < columns; column++, from += parts, to += stride * parts) {
+      for (let part = 0; part < parts; part++) {
+        const a = own[from + part]!;
+        const b = own[from + part + parts]!;
+        const rising = 2 * (b - a);
+        let sum = (2 * a + 1) * stride;
+        for (let k = 0, at = to + part; k < stride; k++, at += parts, sum += rising) cells[at] = sum >> shift;
       }
+      if (parts === 1 && (own[from] === 0 || own[from + 1] === 0)) cells.fill(0, to + 1, to + stride);
     }
   }
   return cells;
