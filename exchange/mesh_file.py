@@ -103,9 +103,18 @@ def _size(solid: Solid) -> int:
 
 def _points(found: list[tuple[Solid, FloatArray]]) -> Points:
     """Point clouds as one; grey where they have no colours."""
-    positions = [np.asarray(cloud.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3] for cloud, matrix in found]
+    positions = [_placed(cloud, matrix) for cloud, matrix in found]
     colours = [_point_colours(cloud) for cloud, _ in found]
     return Points(np.concatenate(positions), np.concatenate(colours))
+
+
+def _placed(solid: Solid, matrix: FloatArray) -> FloatArray:
+    """Where a scene has a solid's vertices. (n, 3) float64"""
+    vertices = np.asarray(solid.vertices, np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ExchangeError(f"vertices: expected three numbers each, got an array of {vertices.shape}")
+    turned: FloatArray = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    return turned
 
 
 def _point_colours(cloud: Any) -> ImageArray:
@@ -119,11 +128,13 @@ def _part(geometry: trimesh.Trimesh, placed: FloatArray, texture: ImageArray | N
     faces = np.asarray(geometry.faces)
     if faces.min() < 0 or faces.max() >= len(geometry.vertices):
         raise ExchangeError("faces: a vertex that does not exist")
-    corners = (np.asarray(geometry.vertices, np.float64) @ placed[:3, :3].T + placed[:3, 3])[faces]
+    corners = _placed(geometry, placed)[faces]
     visual = geometry.visual
     uv = getattr(visual, "uv", None)
+    if uv is not None and np.shape(uv) != (len(geometry.vertices), 2):
+        uv = None  # not two numbers for each vertex
     image = texture if texture is not None else _image(visual)
-    if uv is not None and image is not None and len(uv) == len(geometry.vertices):
+    if uv is not None and image is not None:
         return _coloured(corners, np.asarray(uv, np.float32)[faces], None, image)
     return _coloured(corners, None, _corner_colours(visual, faces), None)
 

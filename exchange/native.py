@@ -16,6 +16,7 @@ The keys are those of make_cyl.py. What a member says of its shape is checked be
 
 from __future__ import annotations
 
+import errno
 import math
 import zipfile
 import zlib
@@ -77,8 +78,12 @@ def read_native(
     try:
         with zipfile.ZipFile(file) as archive:
             return _read(_Members(archive, array_bytes_max), texture)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as problem:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as problem:
         raise ExchangeError(f"no .npz grid: {problem}") from problem
+    except OSError as problem:
+        if problem.errno != errno.EINVAL:  # which a directory of made-up offsets earns, where it seeks before the file
+            raise
+        raise ExchangeError("no .npz grid: it names places outside itself") from problem
 
 
 class _Members:

@@ -94,6 +94,7 @@ class Connection:
         self._opens: deque[m.Open] = deque()
         self._look: m.Look | None = None
         self._running_look: m.Look | None = None
+        self._gave_way = False
         self._news: deque[m.Published] = deque(maxlen=16)
         self._work = asyncio.Event()
         self._acknowledged = asyncio.Event()
@@ -144,7 +145,8 @@ class Connection:
     async def close(self, reason: str, code: WSCloseCode) -> None:
         """Say goodbye and end the stream."""
         if self._session.phase is Phase.READY:
-            await self._send(m.Goodbye(reason))
+            with suppress(ConnectionError):  # gone already
+                await self._send(m.Goodbye(reason))
         await self._socket.close(code=code, message=_cut(reason))
 
     # -- reading ---------------------------------------------------------------------------------------------------
@@ -263,9 +265,7 @@ class Connection:
                 await self._open(self._opens.popleft())
             if self._look is not None:
                 await self._await_ack()
-                look, self._look = self._look, None
-                if look is not None:
-                    await self._answer_look(look)
+                await self._answer_look()
                 if self._opens or self._look is not None or self._news:
                     self._work.set()
 
@@ -300,27 +300,36 @@ class Connection:
         for refinement in view.refinements(bound.epoch):
             await self._send_bytes(refinement)
 
-    async def _answer_look(self, look: m.Look) -> None:
-        bound = self._bound
+    async def _answer_look(self) -> None:
+        """When it is our turn among all streams, plan what is the newest look by then; send what comes of it."""
+        started_s = time.monotonic()
+        async with self._exhibits.turns:
+            bound, look, self._look = self._bound, self._look, None
+            if look is None:  # cancelled while it waited
+                return
+            answer = await self._planned(bound, look)
+        if isinstance(answer, m.Refused | m.Updated):
+            await self._send(answer)
+            return
+        assert bound is not None  # else it was refused
+        spent_s = time.monotonic() - started_s
+        self._rate.encoded(spent_s)
+        await self._send_update(bound, look, answer, spent_s)
+
+    async def _planned(self, bound: Bound | None, look: m.Look) -> Update | ClassicUpdate | m.Refused | m.Updated:
+        """What answers a look, or what is said instead."""
         if bound is None:
             why = "the scan was deleted: open another" if self._is_gone else "open a scan first"
-            await self._send(m.Refused(look.request, "not open", why))
-            return
+            return m.Refused(look.request, "not open", why)
         self._running_look = look
-        started_s = time.monotonic()
         try:
             update = await self._plan(bound, look)
         except (LatticeError, CodecError) as error:
-            await self._send(m.Refused(look.request, "bad request", str(error)[:500]))
-            return
+            return m.Refused(look.request, "bad request", str(error)[:500])
         finally:
             still_wanted, self._running_look = self._running_look is look, None
-        spent_s = time.monotonic() - started_s
-        if update.reason == "superseded" or not still_wanted:
-            await self._send(self._superseded(look))
-            return
-        self._rate.encoded(spent_s)
-        await self._send_update(bound, look, update, spent_s)
+        self._gave_way = update.reason == "superseded"
+        return self._superseded(look) if self._gave_way or not still_wanted else update
 
     async def _plan(self, bound: Bound, look: m.Look) -> Update | ClassicUpdate:
         budget = look.max_bytes
@@ -329,7 +338,8 @@ class Connection:
             budget = affordable if budget is None else min(budget, affordable)
 
         def superseded() -> bool:
-            return self._look is not None or self._running_look is not look
+            """A newer look stops this one, but no two in a row: who clicks faster than we plan gets something, too."""
+            return self._running_look is not look or (self._look is not None and not self._gave_way)
 
         model = self._exhibits.texture_model(bound.scan)
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S

@@ -41,6 +41,7 @@ class Exhibits:
         self._way = way or RightOfWay()
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, "encode", _give_way)
+        self.turns = asyncio.Semaphore(workers)  # of looks that are planned: first come, first served
         self._workers = workers
         self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0

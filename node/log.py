@@ -57,16 +57,18 @@ class JsonFormatter(logging.Formatter):
 
 
 def without_traceback(record: logging.LogRecord) -> bool:
-    """A filter for aiohttp's server: a request that is no HTTP becomes a warning. Lets every record pass.
+    """A filter for aiohttp's server: a request that is no HTTP becomes a warning, one that was cut off nothing.
 
     What the request was stays out: a header that cannot be read may be the one with the token.
     """
     problem = record.exc_info[1] if record.exc_info else None
+    if isinstance(problem, ConnectionError):
+        return False
     if isinstance(problem, HttpProcessingError):
         record.levelno, record.levelname = logging.WARNING, "WARNING"
         record.msg, record.args = "%s: %s", (record.getMessage(), type(problem).__name__)
         record.exc_info = None
-    return True
+    return record.levelno >= logging.getLogger().level
 
 
 def formatter_for(wanted: Format, environ: Mapping[str, str], stderr_descriptor: int) -> logging.Formatter:

@@ -35,9 +35,9 @@ def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:
     """The scans asked for that are there, and why others are not. Raises ConfigError where none is."""
     from tests.bench.scans import STANDARD, Skipped, load
 
-    if args.name == "sphere":
-        return [], []  # it makes its own object, which it can tip over
-    specimens = tuple(args.specimen or (("head",) if args.name in ("line", "capture", "page") else STANDARD))
+    if args.name in ("sphere", "fuzz"):
+        return [], []  # they make their own objects
+    specimens = tuple(args.specimen or (("head",) if args.name in ("line", "capture", "page", "load") else STANDARD))
     if args.texture and len(specimens) != 1:
         raise ConfigError("bench: --texture goes with one --specimen FILE")
     scans, skipped = [], []
@@ -127,9 +127,23 @@ def _capture(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
     return record, capture.told(record)
 
 
+def _load(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.bench import load
+
+    record = load.run(scans[0], args.size, args.seconds, args.viewers, args.clickers)
+    return record, load.told(record)
+
+
+def _fuzz(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
+    from tests.fuzz import campaign
+
+    record = campaign.run(args.target or (), args.count, args.seed)
+    return record, campaign.told(record)
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, list[BenchScan]], Told]] = {
     "line": _line, "roi": _roi, "session": _session, "codec": _codec, "rate": _rate, "alpha": _alpha, "page": _page,
-    "capture": _capture, "sphere": _sphere,
+    "capture": _capture, "sphere": _sphere, "load": _load, "fuzz": _fuzz,
 }  # fmt: skip
 
 
@@ -152,5 +166,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=REPEATS, metavar="N", help=f"of each timing ({REPEATS})")
     parser.add_argument("--rival", action="append", metavar="NAME", help="roi: only these rivals")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="roi: write PNGs of bytes against quality")
-    parser.add_argument("--seconds", type=float, default=60, metavar="S", help="page: of random clicks (60)")
+    parser.add_argument("--seconds", type=float, default=60, metavar="S", help="page, load: of random clicks (60)")
+    parser.add_argument("--target", action="append", metavar="NAME", help="fuzz: only these parsers or ports")
+    parser.add_argument("--count", type=int, default=100_000, metavar="N", help="fuzz: messages for each (100000)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="fuzz: other messages (0)")
+    parser.add_argument("--viewers", type=int, default=200, metavar="N", help="load: connected (200)")
+    parser.add_argument("--clickers", type=int, default=32, metavar="N", help="load: of them that click (32)")
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR", help="where rivals' results are kept")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType
 
 from node import connection
+from node.bound import Bound
 from node.library import About, Library
 from protocol import messages as m
 from protocol.codec import TextureCodec
@@ -64,6 +69,33 @@ async def test_a_client_may_state_what_it_holds_at_any_time(node: Client) -> Non
     updated = m.decode_message((await stream.receive()).data)
     assert isinstance(updated, m.Updated)
     assert (updated.request, updated.next_seq) == (7, 2)
+    await stream.close()
+
+
+async def test_who_clicks_faster_than_the_node_plans_is_answered(
+    node: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Bound.plan
+
+    def slowly(self: Bound, look: m.Look, codecs: Any, budget: Any, superseded: Callable[[], bool], *more: Any) -> Any:
+        until_s = time.monotonic() + 0.2
+        while time.monotonic() < until_s and not superseded():
+            time.sleep(0.002)
+        return plan(self, look, codecs, budget, superseded, *more)
+
+    monkeypatch.setattr(Bound, "plan", slowly)
+    stream, answer = await opened(node)
+    await stream.send_str(m.encode_message(state(answer, 2)))
+    answered: m.Updated | None = None
+    for request in range(2, 1000):
+        await asyncio.sleep(0.03)
+        await stream.send_str(m.encode_message(m.Look(request, 0.5, 0.5, max_bytes=0)))
+        with suppress(TimeoutError):
+            said = m.decode_message((await stream.receive(timeout=0.05)).data)
+            if isinstance(said, m.Updated) and said.reason != "superseded":
+                answered = said
+                break
+    assert answered is not None
     await stream.close()
 
 

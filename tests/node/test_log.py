@@ -5,6 +5,7 @@ import logging
 import os
 from pathlib import Path
 
+import pytest
 from aiohttp.http_exceptions import BadHttpMessage
 
 from node.log import FORMAT, JournalFormatter, JsonFormatter, LineFormatter, formatter_for, without_traceback
@@ -25,6 +26,15 @@ def test_what_is_no_http_is_a_warning_of_one_line_without_what_it_was() -> None:
     said = record("Error handling request from %s", "127.0.0.1", problem=problem)
     assert without_traceback(said)
     assert LineFormatter(FORMAT).format(said) == "WARNING node.x: Error handling request from 127.0.0.1: BadHttpMessage"
+
+
+def test_what_is_no_http_is_not_told_where_only_errors_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.getLogger(), "level", logging.ERROR)
+    assert not without_traceback(record("Error handling request", problem=BadHttpMessage("Bad method")))
+
+
+def test_who_hangs_up_is_not_worth_a_line() -> None:
+    assert not without_traceback(record("Error handling request", problem=ConnectionResetError("Connection lost")))
 
 
 def test_a_bug_keeps_its_traceback() -> None:
