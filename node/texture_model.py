@@ -39,6 +39,7 @@ TILE_SIDES = 64, 256  # texels: a window that people look at has some of them
 TILES_A_TURN = 16
 JOINED_EVERY = 5  # of the tiles two by two, one in so many is coded as one
 MSE_MIN = 1e-3
+MSE_LEAST = 1e-12  # that is worth telling from none; below what any quality is known to leave, yet aimed at
 FIRST_QUALITY = 38
 LOG_MSE_SLOPE = 0.08  # of a step of quality, on typical skin
 LOG_BYTES_SLOPE = 0.07
@@ -76,7 +77,7 @@ class Expected:
     def quality_for_mse(self, mse: float) -> int:
         """The lowest quality that should leave no more than this error."""
         falling = np.minimum.accumulate(self.log_mse)
-        wanted = np.log(max(mse, MSE_MIN))
+        wanted = np.log(max(mse, MSE_LEAST))
         slope = self._last_slope(falling)
         beyond = min((wanted - falling[-1]) / slope, LOSSLESS) if slope < 0 and wanted < falling[-1] else 0
         return int(np.ceil(np.interp(-wanted, -falling, self.qualities) + beyond))

@@ -104,6 +104,18 @@ def test_reaches_the_quality_asked_for(scan: Scan, view: FirstView, codec: m.Cod
     assert update.texture_db == pytest.approx(viewer.texture_db(look), abs=0.01)
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_everything_there_is_can_be_asked_for(
+    scan: Scan, view: FirstView, model_of_texture: TextureModel, known: bool
+) -> None:
+    viewer = Viewer(scan, view)
+    look = Look(1, 0.7, 0.5, texture_db=100, range_mm=0)
+    update = plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture if known else None)
+    viewer.take(update)
+    assert update.texture_db is not None and update.texture_db >= 55  # the codec's best, on noise
+    assert viewer.range_error_mm(look) == 0
+
+
 def test_says_the_largest_error_left_in_the_window(scan: Scan, view: FirstView) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, 0.62, 0.3)
