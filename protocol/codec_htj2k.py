@@ -29,6 +29,7 @@ _SOT, _SOD = 0xFF90, 0xFF93
 _EOC = b"\xff\xd9"
 _TILE_HEADER_BYTES = 14
 _GUARD_BITS = 1
+_ROOM = 128  # below black, of nine bits
 
 # L2 norms of the 9/7 synthesis low-pass and high-pass filters after 0, 1, 2 ... levels, as OpenJPH rounds them.
 _NORM_LOW = (1.0, 1.4021, 2.0304, 2.9012, 4.1153, 5.8245, 8.2388, 11.652)
@@ -61,22 +62,23 @@ def decode(payload: bytes, shape: tuple[int, ...], quality: int) -> Samples:
     shape : (h, w) for uint16, (h, w, 3) for uint8 RGB; the caller bounds it.
     Raises CodecError for a payload without its end, for one that does not decode, and for a bad quality.
     """
-    stream = restore(payload, shape, quality)
+    is_roomy = len(shape) == 3 and quality != LOSSLESS
+    stream = restore(payload, shape, quality, roomy=is_roomy)
     samples = _decode(stream, resilient=False)
     # imagecodecs drops an error half way through and leaves the rows below it zero: look twice at a last row of zeros.
     if not samples[-1].any() and not np.array_equal(samples, _decode(stream, resilient=True)):
         raise CodecError("HTJ2K does not decode: damaged packets")
-    dtype = np.uint8 if len(shape) == 3 else np.uint16
+    dtype = np.uint8 if len(shape) == 3 and not is_roomy else np.uint16
     if samples.shape != shape or samples.dtype != dtype:
         raise CodecError(f"HTJ2K decoded to {samples.shape} {samples.dtype}, not {shape} {dtype.__name__}")
-    return samples
+    return np.clip(samples.view(np.int16) - _ROOM, 0, 255).astype(np.uint8) if is_roomy else samples
 
 
-def restore(payload: bytes, shape: tuple[int, ...], quality: int) -> bytes:
-    """The whole code stream of a payload, headers rebuilt from shape and quality."""
+def restore(payload: bytes, shape: tuple[int, ...], quality: int, *, roomy: bool = False) -> bytes:
+    """The whole code stream of a payload, headers rebuilt from shape and quality; roomy : see `main_header`."""
     if payload[-2:] != _EOC:
         raise CodecError("HTJ2K payload is cut short: no end marker")
-    return main_header(shape, quality) + _tile_header(len(payload) - len(_EOC)) + payload
+    return main_header(shape, quality, roomy=roomy) + _tile_header(len(payload) - len(_EOC)) + payload
 
 
 def decomposition_levels(shape: tuple[int, ...]) -> int:
@@ -84,15 +86,20 @@ def decomposition_levels(shape: tuple[int, ...]) -> int:
     return min(max(min(shape[:2]).bit_length() - 2, 1), LEVELS_MAX)
 
 
-def main_header(shape: tuple[int, ...], quality: int) -> bytes:
-    """SOC SIZ CAP COD QCD, byte for byte as OpenJPH writes them."""
+def main_header(shape: tuple[int, ...], quality: int, *, roomy: bool = False) -> bytes:
+    """SOC SIZ CAP COD QCD, byte for byte as OpenJPH writes them.
+
+    roomy : for lossy texture, headers under which the same packets decode to nine bits, _ROOM above what they were.
+    Lossy decoding overshoots black and white, and imagecodecs wraps what does not fit a sample round: white to black.
+    One bit more of range doubles each step, one more of exponent halves it, and a guard bit less keeps their number.
+    """
     if not (0 <= quality <= LOSSY_MAX or quality == LOSSLESS):
         raise CodecError(f"HTJ2K quality must be 0..{LOSSY_MAX} or {LOSSLESS}, got {quality}")
     levels, colour = decomposition_levels(shape), len(shape) == 3
-    quantisation, bits = (_reversible if quality == LOSSLESS else _irreversible)(levels, colour, quality)
+    quantisation, bits = _reversible(levels, colour) if quality == LOSSLESS else _irreversible(levels, quality, roomy)
     return b"".join((
         struct.pack(">H", _SOC),
-        _segment(_SIZ, _size(shape)),
+        _segment(_SIZ, _size(shape, roomy)),
         _segment(_CAP, struct.pack(">IH", 0x00020000, _magnitude_bound(bits) | (0 if quality == LOSSLESS else 0x20))),
         _segment(_COD, struct.pack(">BBHBBBBBB", 0, 2, 1, colour, levels, 4, 4, 0x40, quality == LOSSLESS)),
         _segment(_QCD, quantisation),
@@ -120,9 +127,9 @@ def _segment(marker: int, body: bytes) -> bytes:
     return struct.pack(">HH", marker, 2 + len(body)) + body
 
 
-def _size(shape: tuple[int, ...]) -> bytes:
+def _size(shape: tuple[int, ...], roomy: bool) -> bytes:
     height, width = shape[:2]
-    components = bytes((7, 1, 1)) * 3 if len(shape) == 3 else bytes((15, 1, 1))
+    components = bytes((7 + roomy, 1, 1)) * 3 if len(shape) == 3 else bytes((15, 1, 1))
     return struct.pack(">H8IH", 0x4000, width, height, 0, 0, width, height, 0, 0, len(components) // 3) + components
 
 
@@ -134,22 +141,22 @@ def _step(quality: int) -> float:
     return float(2.0 ** (-quality / 8))
 
 
-def _reversible(levels: int, colour: bool, quality: int) -> tuple[bytes, int]:
+def _reversible(levels: int, colour: bool) -> tuple[bytes, int]:
     """QCD body without quantisation, and the most magnitude bits of any subband."""
     depth = 8 + 1 if colour else 16
     bits = [depth + 1] + [depth + grown for level in range(levels, 0, -1) for grown in _GROWTH[level - 1]]
     return bytes((_GUARD_BITS << 5, *(b << 3 for b in bits))), max(bits)
 
 
-def _irreversible(levels: int, colour: bool, quality: int) -> tuple[bytes, int]:
+def _irreversible(levels: int, quality: int, roomy: bool) -> tuple[bytes, int]:
     """QCD body with one step a subband, and the magnitude bits of the finest HL (what OpenJPH takes for the bound)."""
     norms = [_NORM_LOW[levels] ** 2]
     for level in range(levels, 0, -1):
         low, high = _NORM_LOW[level], _NORM_HIGH[level - 1]
         norms += [low * high, low * high, high * high]
     steps = [_exponent_and_mantissa(_step(quality) / norm) for norm in norms]
-    packed = [exponent << 11 | mantissa for exponent, mantissa in steps]
-    return struct.pack(f">B{len(packed)}H", _GUARD_BITS << 5 | 2, *packed), steps[-3][0]
+    packed = [exponent + roomy << 11 | mantissa for exponent, mantissa in steps]
+    return struct.pack(f">B{len(packed)}H", _GUARD_BITS - roomy << 5 | 2, *packed), steps[-3][0]
 
 
 def _exponent_and_mantissa(step: float) -> tuple[int, int]:

@@ -29,6 +29,7 @@ TEXTURES = (
     ("htj2k_one_texel", TextureCodec.HTJ2K, 40, (1, 1)),
     ("htj2k_coarse", TextureCodec.HTJ2K, 36, (33, 40)),
     ("htj2k_fine", TextureCodec.HTJ2K, 61, (64, 72)),
+    ("htj2k_black_and_white", TextureCodec.HTJ2K, 40, (40, 48)),
     ("htj2k_lossless", TextureCodec.HTJ2K, codec.LOSSLESS, (16, 48)),
 )
 RANGES = (
@@ -71,7 +72,7 @@ def header_hashes() -> dict[str, str]:
 
 def _texture_vectors() -> Iterator[dict[str, Any]]:
     for name, kind, quality, shape in TEXTURES:
-        payload = codec.encode_texture(_texture(shape), kind, quality)
+        payload = codec.encode_texture(_bars(shape) if name.endswith("white") else _texture(shape), kind, quality)
         image = codec.decode_texture(payload, kind, quality, shape)
         if kind == TextureCodec.JPEG:
             stream = codec_jpeg.restore(payload, shape, codec.jpeg_q(quality))
@@ -112,6 +113,12 @@ def _write(name: str, channel: str, payload: bytes, samples: NDArray[Any], **fac
 def _texture(shape: tuple[int, int]) -> ImageArray:
     y, x = np.mgrid[: shape[0], : shape[1]]
     return np.stack([90 + x * y % 97, 40 + (3 * x + 2 * y) % 128, 200 - (x ^ y) % 101], axis=2).astype(np.uint8)
+
+
+def _bars(shape: tuple[int, int]) -> ImageArray:
+    """Black on white, which a lossy decoder overshoots on both sides."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return np.where(((x // 5 + y // 7) % 3 == 0)[..., None], 0, 255).repeat(3, axis=2).astype(np.uint8)
 
 
 def _range(shape: tuple[int, int]) -> StepArray:

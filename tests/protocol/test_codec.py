@@ -91,6 +91,16 @@ def test_any_texture_returns_exactly_when_lossless(image: ImageArray) -> None:
     np.testing.assert_array_equal(decoded, image)
 
 
+@pytest.mark.parametrize(
+    ("kind", "quality"), [(TextureCodec.HTJ2K, q) for q in range(8, 96, 8)] + [(TextureCodec.JPEG, q) for q in (16, 53)]
+)
+def test_black_and_white_stay_so_at_every_quality(kind: TextureCodec, quality: int) -> None:
+    image = np.full((64, 96, 3), 255, np.uint8)
+    cv2.putText(image, "wrap", (2, 45), cv2.FONT_HERSHEY_SIMPLEX, 1.2, (0, 0, 0), 4)
+    decoded = codec.decode_texture(codec.encode_texture(image, kind, quality), kind, quality, (64, 96))
+    assert cv2.PSNR(image, decoded) > min(10 + quality / 2, 50)
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("kind", "quality"), LOSSY)
 def test_lossy_texture_keeps_its_shape_at_every_quality(
