@@ -67,7 +67,8 @@ def reach_range(
     kept = ~_of_region(_adopted(held.shape, coded), region)
     if poor[kept].sum() + _cells_beyond(scan, coded, region, target_steps) <= allowed:
         return first
-    second = _mend(scan, after, region, wanted, target_steps, _worst(poor, allowed), allowed)
+    worst = _worst(poor, allowed)
+    second = _mend(scan, after, region, wanted, target_steps, worst, allowed - int(poor[~worst].sum()))
     return [*first, second] if second is not None else first
 
 
@@ -80,13 +81,16 @@ def _mend(
     poor: BoolArray,
     allowed: int,
 ) -> Coded | None:
-    """Encode the poor blocks again: at the spacing wanted where that makes them good enough, else at spacing 1."""
+    """Encode the poor blocks again: at the spacing wanted where that makes them good enough, else at spacing 1.
+
+    allowed : how many of their cells may still be too far off.
+    """
     held = state.holdings.channels[Channel.RANGE]
     rank, level = (_of_region(array, region)[poor] for array in (held.rank, held.level))
     best = 65535 - int(rank.max())
     if wanted.p > 1 and level.min() >= _level_at(wanted.p):
         coded = _code_listed(scan, state, region, RangeParameters(wanted.p, best - 1, None), ~poor)
-        if coded is not None and _cells_beyond(scan, coded, region, target_steps) <= allowed // 2:
+        if coded is not None and _cells_beyond(scan, coded, region, target_steps) <= allowed:
             return coded
     quantum = min(2 * int(target_steps) + 1, best - 1)  # at spacing 1 no cell is off by more than half a quantum
     if quantum < 1:

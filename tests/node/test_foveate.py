@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -309,6 +310,21 @@ def test_overlapping_windows_reach_their_quality_too(
         viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture))
         assert viewer.range_error_mm(look) <= range_mm
         assert viewer.texture_db(look) >= look.texture_db - 0.01
+
+
+def test_cells_kept_and_cells_mended_share_one_allowance(tmp_path: Path) -> None:
+    """What is kept of a held window uses up most of the 1% that may be off, so what is mended must leave little."""
+    grid, random = make_specimen("head", "S").grid, np.random.default_rng(1)
+    (height, width), block = grid.range_steps.shape, 8
+    rough = 40 * (0.2 + random.random((height // block + 1, width // block)) ** 3)
+    noise = random.normal(size=(height, width)) * rough.repeat(block, 0).repeat(block, 1)[:height]
+    noisy = np.clip(grid.range_steps + np.round(noise), 1, 65535)
+    scan = keep(replace(grid, range_steps=np.where(grid.range_steps == VOID, VOID, noisy).astype(np.uint16)), tmp_path)
+    viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
+    for u, v in ((0.796, 0.912), (0.873, 0.985)):
+        look = Look(1, u, v, texture_db=5, range_mm=0.3)
+        viewer.take(plan_update(scan, viewer.state, look, "htj2k"))
+        assert viewer.range_error_mm(look) <= look.range_mm
 
 
 @pytest.mark.parametrize("codec", ["htj2k", "jpeg"])
