@@ -119,10 +119,11 @@ def build_parser() -> argparse.ArgumentParser:
 def add_own_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer what needs several programs at once."""
     demo = subparsers.add_parser("demo", help="bring up a simulated scanner and a node, sweep once, serve until Ctrl-C")
-    demo.add_argument("--specimen", default="head", metavar="NAME|FILE", help="what stands on the turntable (head)")
+    demo.add_argument("--specimen", default="head", metavar="NAME|FILE", help=simulators.command.SPECIMEN_HELP)
     demo.add_argument("--texture", metavar="IMAGE", help="texture of a specimen read from a .npz grid")
     demo.add_argument("--size", choices=("S", "M", "L"), default="S", help="size class of the scan (S)")
-    demo.add_argument("--link-rate", metavar="BYTES_S", help="bytes a second over the link, instead of its baud rate")
+    rate_help = "bytes a second over the line, instead of its baud rate"
+    demo.add_argument("--link-rate", type=simulators.command.link_rate, metavar="BYTES_S", help=rate_help)
     demo.add_argument("--once", action="store_true", help="look at three places, compare with the truth, and end")
     demo.add_argument("--json", action="store_true", help="with --once: print one JSON object")
     demo.set_defaults(run=run_demo)
@@ -235,7 +236,7 @@ def _simulate(args: argparse.Namespace, folder: str) -> list[str]:
     command += ["--closed", f"{folder}/{CLOSED}"]
     for option in ("specimen", "texture", "size", "link_rate"):
         if (value := getattr(args, option)) is not None:
-            command += [f"--{option.replace('_', '-')}", value]
+            command += [f"--{option.replace('_', '-')}", str(value)]
     return command
 
 

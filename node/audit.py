@@ -37,6 +37,7 @@ SEEN_AGAIN_S = 600.0  # looking at the same scan again within so long is no new 
 SEEN_MAX = 4096
 REFUSALS, REFUSALS_S = 100, 10.0  # so many are written down within so long, the others are counted
 WHAT_MAX = 300
+TIME = "0000-00-00T00:00:00.000Z"
 
 Event = Literal[
     "started", "stopped", "listed", "watched", "opened", "seen", "read", "exported", "imported", "scanned", "derived",
@@ -219,6 +220,13 @@ def done_trail(library: Path, bytes_max: int) -> Trail:
 def refused_trail(library: Path) -> Trail:
     """Where refusals are kept."""
     return Trail(library / FOLDER, "refused", REFUSED_BYTES_MAX)
+
+
+def begins_a_time(text: str) -> bool:
+    """Whether an `Entry.at` could begin so."""
+    return len(text) <= len(TIME) and all(
+        char in "0123456789" if place == "0" else char == place for char, place in zip(text, TIME, strict=False)
+    )
 
 
 def read_trail(trail: Trail, *, since: str = "", scan: str = "", by: str = "") -> Iterator[Entry]:

@@ -20,7 +20,7 @@ SINCE_HELP = "not older than this, such as 2026-11 or 2026-11-22 (UTC)"
 def add_audit_action(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
     """Offer `audit`."""
     audit = actions.add_parser("audit", help="who saw, changed, exported or deleted which scan, newest first")
-    audit.add_argument("--since", default="", metavar="DATE", help=SINCE_HELP)
+    audit.add_argument("--since", type=_since, default="", metavar="DATE", help=SINCE_HELP)
     audit.add_argument("--scan", default="", metavar="ID", help="of this scan: its id, or the beginning of it")
     audit.add_argument("--by", default="", metavar="NAME", help="of this login alone")
     audit.add_argument("--refused", action="store_true", help="who was turned away instead")
@@ -66,6 +66,14 @@ def _line(one: Entry) -> str:
     who = " ".join(filter(None, (one.by, one.role and f"({one.role})", one.address and f"at {one.address}")))
     parts = one.at, f"{one.event:14}", one.scan or one.sweep, who, one.what, left_out
     return printable("  ".join(filter(None, parts)))
+
+
+def _since(text: str) -> str:
+    from node.audit import begins_a_time
+
+    if not begins_a_time(text):
+        raise argparse.ArgumentTypeError(f"expected a date such as 2026-11 or 2026-11-22, got {text!r}")
+    return text
 
 
 def _limit(text: str) -> int:

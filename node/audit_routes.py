@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 from aiohttp import web
 
-from node.audit import Audit, Event, done_trail, read_trail, refused_trail
+from node.audit import Audit, Event, begins_a_time, done_trail, read_trail, refused_trail
 from node.auth import asker, place_of, require
 
 LIMIT, LIMIT_MAX = 100, 1000
@@ -80,6 +80,8 @@ class AuditRoutes:
             known = ", ".join(sorted(QUERY_KEYS))
             raise web.HTTPBadRequest(text=f"unknown: {', '.join(sorted(unknown))}; known: {known}")
         limit = _limit(query.get("limit", str(LIMIT)))
+        if not begins_a_time(query.get("since", "")):
+            raise web.HTTPBadRequest(text="since: expected the beginning of a time, such as 2026-11-22")
         trail = self._refused if query.get("refused", "0") == "1" else self._done
         found = read_trail(trail, since=query.get("since", ""), scan=query.get("scan", ""), by=query.get("by", ""))
         entries = await asyncio.to_thread(lambda: list(islice(found, limit)))

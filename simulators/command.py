@@ -22,6 +22,7 @@ BITS_PER_BYTE = 10  # on a serial line: start, eight data, stop
 BAUD = 3_000_000
 USB_BYTES_S = 35e6
 USB_PORTION_BYTES = 65536
+SPECIMEN_HELP = "head, nutcracker, sphere, cylinder, pebble, or a .npz grid, mesh or Echo file (head)"
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,7 +40,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
         "--specimen",
         default="head",
         metavar="NAME|FILE",
-        help="head, nutcracker, sphere, cylinder, pebble, or a .npz grid, mesh or Echo file (head)",
+        help=SPECIMEN_HELP,
     )
     simulate.add_argument("--texture", type=Path, metavar="IMAGE", help="texture of a specimen from a file")
     simulate.add_argument("--size", choices=("S", "M", "L"), default="S", help="of a generated specimen or a mesh (S)")
@@ -54,7 +55,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     baud_help = "of the line (pty: 3000000; tcp, usb: 35e6 bytes a second)"
     speed.add_argument("--baud", type=_whole(300, 10**9), help=baud_help)
     speed.add_argument(
-        "--link-rate", type=_real(30, 1e9), metavar="BYTES_S", help="bytes a second over the line, instead of --baud"
+        "--link-rate", type=link_rate, metavar="BYTES_S", help="bytes a second over the line, instead of --baud"
     )
     simulate.add_argument(
         "--faults",
@@ -197,3 +198,6 @@ def _real(low: float, high: float) -> Callable[[str], float]:
         return value
 
     return number
+
+
+link_rate = _real(30, 1e9)  # bytes a second over a line

@@ -51,8 +51,11 @@ def test_version_is_the_one_of_the_distribution() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [(), ("no-such-command",), ("demo", "--size", "XL"), ("demo", "--siz", "S"), ("serve", "--baud", "5")],
-)
+    [
+        (), ("no-such-command",), ("demo", "--size", "XL"), ("demo", "--siz", "S"), ("demo", "--link-rate", "0"),
+        ("serve", "--baud", "5"), ("access", "audit", "--since", "yesterday"),
+    ],
+)  # fmt: skip
 def test_wrong_usage_is_status_2_and_a_hint(arguments: tuple[str, ...]) -> None:
     done = foveascan_process(*arguments)
     assert (done.returncode, done.stdout) == (2, "")

@@ -126,6 +126,6 @@ async def test_an_admin_reads_the_log(node: Entrance) -> None:
     async with node.ask("GET", f"/v1/audit?limit=1&scan={node.scan[:8]}&by=admin&since=2026", admin) as answer:
         [one] = await answer.json()
         assert (one["event"], one["by"], one["scan"]) == ("read", "admin", node.scan)
-    for query in ("limit=0", "limit=1001", "limit=x", "who=me"):
+    for query in ("limit=0", "limit=1001", "limit=x", "who=me", "since=yesterday"):
         async with node.ask("GET", f"/v1/audit?{query}", admin) as answer:
             assert answer.status == 400
