@@ -87,7 +87,7 @@ async def _ready(session: Session) -> dict[str, Any]:
     for _ in range(round(10 / POLL_S)):
         status = await session.scanner()
         if status["phase"] == "no scanner":
-            raise ScannerFault("this node has no scanner: start it with --scanner PATH")
+            raise ScannerFault("this node has no scanner: start it with --scanner ADDRESS")
         if status["phase"] == "ready":
             return status
         await asyncio.sleep(POLL_S)

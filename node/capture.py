@@ -63,7 +63,7 @@ class CaptureStatus:
             case "ready":
                 return ""
             case "no scanner":
-                return "this node has no scanner: start it with --scanner PATH"
+                return "this node has no scanner: start it with --scanner ADDRESS"
             case "connecting":
                 return f"the scanner is not connected: {self.why or 'it has not answered yet'}"
             case "stopped":

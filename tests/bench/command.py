@@ -153,6 +153,15 @@ def _where(conditions: dict[str, Any]) -> str:
     return f"{conditions['date']}, commit {conditions['commit']}, {machine}; Python {conditions['python']}, {versions}"
 
 
+def _some(text: str) -> int:
+    """A number of at least one."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected 1 or more, got {number}")
+    return number
+
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What `foveascan bench` takes."""
     parser.add_argument("name", nargs="?", choices=BENCHES, default="line", help="what to measure (line)")
@@ -162,13 +171,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--texture", metavar="IMAGE", help="texture of a grid FILE")
     parser.add_argument("--size", choices=("S", "M", "L"), default="M", help="size class (M)")
-    parser.add_argument("--clicks", type=int, default=5, metavar="N", help="foveae a scan (5)")
-    parser.add_argument("--repeats", type=int, default=REPEATS, metavar="N", help=f"of each timing ({REPEATS})")
+    parser.add_argument("--clicks", type=_some, default=5, metavar="N", help="foveae a scan (5)")
+    parser.add_argument("--repeats", type=_some, default=REPEATS, metavar="N", help=f"of each timing ({REPEATS})")
     parser.add_argument("--rival", action="append", metavar="NAME", help="roi: only these rivals")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="roi: write PNGs of bytes against quality")
     parser.add_argument("--seconds", type=float, default=60, metavar="S", help="page, load: of random clicks (60)")
     parser.add_argument("--target", action="append", metavar="NAME", help="fuzz: only these parsers or ports")
-    parser.add_argument("--count", type=int, default=100_000, metavar="N", help="fuzz: messages for each (100000)")
+    parser.add_argument("--count", type=_some, default=100_000, metavar="N", help="fuzz: messages for each (100000)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="fuzz: other messages (0)")
     parser.add_argument("--viewers", type=int, default=200, metavar="N", help="load: connected (200)")
     parser.add_argument("--clickers", type=int, default=32, metavar="N", help="load: of them that click (32)")

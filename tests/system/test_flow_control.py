@@ -50,13 +50,14 @@ async def sweep_beside(url: str) -> tuple[str, int]:
             await until_updated(session, looking)
             await session.start_sweep()
             async with asyncio.timeout(120):
-                scan = await anext(published)
+                async for scan in published:
+                    if (quality := await session.quality(scan)) is not None:  # else a sphere made of an earlier sweep
+                        break
         finally:
             for task in looking:
                 task.cancel()
             ended = await asyncio.gather(*looking, return_exceptions=True)
         assert all(isinstance(end, asyncio.CancelledError | NodeLost) for end in ended), ended
-        quality = await session.quality(scan)
     assert quality is not None and quality.dropped_bytes == 0
     return scan, quality.requested_columns
 

@@ -140,7 +140,9 @@ def check_scans(library: Library, promises: Promises) -> None:
     assert [problem for _, problem in library.verify() if problem is not None] == []
     assert set(os.listdir(library.folder)) - OWN == listed
     for scan_id in listed:
-        assert len(os.listdir(library.folder / scan_id)) in (3, 4)
+        files = set(os.listdir(library.folder / scan_id))
+        assert {"scan.json", "range.npy", "texture.npy"} <= files
+        assert files <= {"scan.json", "range.npy", "texture.npy", "repairs.npy", "sidecar.json"}
         sidecar = library.sidecar(scan_id)
         assert sidecar.revision in (promises.said[scan_id], promises.said[scan_id] + 1)
         assert sidecar.notes == (f"note {sidecar.revision}" if sidecar.revision else "")
