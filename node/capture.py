@@ -10,8 +10,8 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Generator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -137,6 +137,7 @@ class Capture:
         self._stop = threading.Event()
         self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
         self._order: SweepRequest | _Resume | None = None
+        self._all_in = False  # of a sweep whose grid is being delivered: the next one may be asked for
         self._port: Port | None = None
         self._status = CaptureStatus("connecting")
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
@@ -161,7 +162,11 @@ class Capture:
         self._thread.start()
 
     def request_sweep(self) -> bool:
-        """Ask for a sweep; False, and nothing will come of it, when the scanner is not ready: see status.refusal."""
+        """Ask for a sweep; False, and nothing will come of it, when the scanner is not ready: see status.refusal.
+
+        While the grid of the last sweep is being delivered the next one may be asked for: who hears of the new scan
+        hears of it before the thread is done with it.
+        """
         return self._request(self._sweep_request)
 
     def request_resume(self, sweep_id: str) -> bool:
@@ -180,7 +185,7 @@ class Capture:
 
     def _request(self, order: SweepRequest | _Resume) -> bool:
         with self._lock:
-            if self._now().refusal:
+            if self._order is not None or (self._status.refusal and not self._all_in):
                 return False
             self._order = order
         self._wake()
@@ -279,8 +284,8 @@ class Capture:
         self._status = replace(self._status, phase="sweeping", progress=sweep.held / sweep.expected)
         held = list(self._sweeps.columns(sweep.id))
         if sweep.is_complete:
-            publish(self._sweeps, sweep, self._deliver, self._repairs)
-            self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+            with self._delivering():
+                publish(self._sweeps, sweep, self._deliver, self._repairs)
             return
         if order.by_itself:
             events = scanner.resume(sweep.header, held, self._stop)
@@ -296,12 +301,13 @@ class Capture:
         try:
             self._follow(events, running)
         except FoveascanError as error:
-            self._watch(SweepInterrupted(str(error), None, SweepReport()))
             running.leave(str(error))
             self.counts.interrupted += 1
+            if not isinstance(error, DriverError):
+                self._end(str(error))
+            self._watch(SweepInterrupted(str(error), None, SweepReport()))
             if isinstance(error, DriverError):
                 raise
-            self._end(str(error))
 
     def _follow(self, events: SweepEvents, running: RunningSweep) -> None:
         """Hand every event to whom it concerns. Raises FoveascanError."""
@@ -321,8 +327,8 @@ class Capture:
                         running.flush()
                         self._status = replace(self._status, progress=share)
                     case SweepFinished(report):
-                        running.finish(self._deliver, report)
-                        self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+                        with self._delivering():
+                            running.finish(self._deliver, report)
                     case SweepInterrupted(cause=PortLost() as cause):
                         raise cause
                     case SweepInterrupted(reason):
@@ -330,6 +336,16 @@ class Capture:
                         self.counts.interrupted += 1
                         self._end(f"sweep interrupted: {reason}")
                 self._watch(event)
+
+    @contextmanager
+    def _delivering(self) -> Iterator[None]:
+        """While the grid of a sweep that is all in is being delivered; ready when it is."""
+        self._all_in = True
+        try:
+            yield
+            self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+        finally:
+            self._all_in = False
 
     def _end(self, why: str) -> None:
         log.warning("%s", why)

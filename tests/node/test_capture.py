@@ -18,6 +18,7 @@ from node.capture import Capture, CaptureStatus
 from node.journal import Journals
 from node.scan_quality import coverage_of
 from protocol.errors import PortLost
+from protocol.grid import Grid
 from protocol.scanner_messages import SweepRequest
 from simulators.faults import FaultyScanner, parse_faults
 from simulators.scanner import SimulatedScanner
@@ -36,6 +37,28 @@ def test_a_sweep_becomes_a_grid_and_its_journal_goes(plug: Plug, node: Node, tmp
         assert node.capture.status.sweeps == count
     assert list((tmp_path / "sweeps").iterdir()) == []
     assert node.sweeps.interrupted() == []
+
+
+def test_who_hears_of_a_scan_may_ask_for_the_next_one_at_once(plug: Plug, node: Node) -> None:
+    asked: queue.Queue[tuple[bool, bool]] = queue.Queue()
+    keep = node.deliver
+    grids: list[Grid] = []
+
+    def ask_again(grid: Grid) -> None:
+        keep(grid)
+        grids.append(grid)
+        if len(grids) == 1:
+            asked.put((node.capture.request_sweep(), node.capture.request_sweep()))
+
+    node.deliver = ask_again
+    plug.plug(device())
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    assert asked.get(timeout=WAIT_S) == (True, False)  # the next one, and no third
+    for _ in range(2):
+        assert is_truth(node.grids.get(timeout=WAIT_S))
+    node.wait_until("ready")
+    assert node.capture.status.sweeps == 2
 
 
 def test_a_scan_comes_with_its_quality_and_what_was_measured_where_it_was_repaired(plug: Plug, node: Node) -> None:
