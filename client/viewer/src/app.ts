@@ -2,7 +2,9 @@
 
 import { deleteScan, listScans, readAccount, readCapture } from './api.ts';
 import type { Sidecar } from './api.ts';
-import type { Answer, FromWorker, LinkState, Snapshot, ToWorker } from './link.ts';
+import type { FromWorker, LinkState, ToWorker } from './link.ts';
+import { Measuring } from './measuring.ts';
+import { Pane } from './pane.ts';
 import type { ScanInfo } from './protocol/messages.ts';
 import { OpenSidecar } from './sidecar.ts';
 import { strings } from './strings.ts';
@@ -11,29 +13,27 @@ import { AboutPanel } from './ui/about_panel.ts';
 import { CostPanel } from './ui/cost_panel.ts';
 import { DisplayPanel } from './ui/display_panel.ts';
 import { Frame } from './ui/frame.ts';
-import { listen } from './ui/gestures.ts';
 import { LookPanel } from './ui/look_panel.ts';
 import type { Tool } from './ui/look_panel.ts';
-import { Marks } from './ui/marks.ts';
 import { PinsPanel } from './ui/pins_panel.ts';
 import { ScanList } from './ui/scan_list.ts';
 import { ScannerPanel } from './ui/scanner_panel.ts';
 import { WorthPanel } from './ui/worth_panel.ts';
 import { formatState, parseState } from './url_state.ts';
-import type { Pin } from './url_state.ts';
+import type { Pin, ViewState } from './url_state.ts';
 import type { Place } from './view/room.ts';
-import { Stage } from './view/stage.ts';
 
 const CAPTURE_MS = 2000;
 const WRITE_MS = 200;
+const NOWHERE: ViewState = { scan: null, camera: null, foveae: [], pins: [] };
 
 export class App {
   private readonly frame: Frame;
-  private readonly stage: Stage;
-  private readonly marks: Marks;
+  private readonly pane: Pane;
+  private readonly measuring: Measuring;
   private readonly scans: ScanList;
   private readonly scanner = new ScannerPanel(() => void this.sweep.start(), () => this.sweep.watch());
-  private readonly look = new LookPanel(() => this.atMiddle((place) => this.sharpen(place)), (tool) => this.toolChanged(tool));
+  private readonly look = new LookPanel(() => this.sharpen(this.pane.stage.pickMiddle()), (tool) => this.toolChanged(tool));
   private readonly display: DisplayPanel;
   private readonly cost = new CostPanel();
   private readonly pinsPanel: PinsPanel;
@@ -43,30 +43,29 @@ export class App {
   private readonly sidecar: OpenSidecar;
 
   private state = parseState(location.hash.slice(1));
-  private info: ScanInfo | null = null;
   private mayChange = false;
-  private looks = 0;
-  private looking: { look: number; place: Place } | null = null;
-  private queue: Place[] = [];
-  private measured: Place[] = [];
   private writing: ReturnType<typeof setTimeout> | undefined;
 
   constructor(
-    root: HTMLElement, private readonly worker: Worker, private readonly canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
+    root: HTMLElement, private readonly worker: Worker, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
   ) {
-    const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
-    this.frame = new Frame(root, canvas, {
-      retry: () => this.tell({ kind: 'retry' }), zoom: (steps) => this.stage.zoom(steps), home: () => this.home(),
-    });
-    this.stage = new Stage(canvas, context, {
-      drawn: () => this.marks?.update(),
-      settled: () => this.writeState(),
-      lost: () => this.frame.say(strings.link.graphicsLost),
-      restored: () => this.tell({ kind: 'restore' }),
-    }, calm);
-    this.marks = new Marks(this.stage);
     const say = (text: string) => this.frame.say(text);
-    this.sweep = new Sweep(this.stage, this.scanner, {
+    this.frame = new Frame(root, {
+      retry: () => this.tell({ kind: 'retry' }), zoom: (steps) => this.pane.stage.zoom(steps), home: () => this.home(),
+    });
+    canvas.id = 'view';
+    this.pane = new Pane(worker, canvas, context, () => this.look.options, {
+      say,
+      opened: (info, fresh, framed) => this.opened(info, fresh, framed),
+      updated: (answer) => this.cost.answered(answer),
+      missing: () => this.missing(),
+      clicked: (place) => this.clicked(place),
+      hovered: (place) => this.hovered(place),
+      home: () => this.home(),
+      changed: () => this.writeState(),
+    }, document.documentElement);
+    this.measuring = new Measuring(this.pane.stage, this.pane.marks, say);
+    this.sweep = new Sweep(this.pane.stage, this.scanner, {
       say, watched: () => this.watched(), ended: (scan) => this.sweepEnded(scan), changed: () => void this.refreshCapture(),
     });
     this.sidecar = new OpenSidecar({ say, known: (scan, sidecar) => this.takeSidecar(scan, sidecar) });
@@ -74,11 +73,13 @@ export class App {
     this.pinsPanel = new PinsPanel((pin) => void this.keepPins([...this.state.pins, pin]),
       (index) => void this.keepPins(this.state.pins.filter((_, at) => at !== index)), (pin) => this.goTo(pin));
     this.about = new AboutPanel((changes) => void this.sidecar.save(changes, true), () => void this.remove());
-    this.display = new DisplayPanel((shading, overlay) => this.stage.setLook(shading, overlay));
-    this.frame.stage.append(this.display.legend, this.marks.element);
+    this.display = new DisplayPanel((shading, overlay) => this.pane.stage.setLook(shading, overlay));
+    this.frame.pictures.append(this.pane.element);
+    this.frame.stage.append(this.display.legend);
     this.frame.add(this.scans.element, this.scanner.element, this.look.element, this.display.element, this.pinsPanel.element,
       this.worth.element, this.cost.element, this.about.element);
-    this.listen();
+    addEventListener('hashchange', () => this.addressChanged());
+    addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
     void this.refreshScans();
     void this.refreshCapture();
@@ -96,26 +97,11 @@ export class App {
       case 'link':
         this.linked(said.link);
         break;
-      case 'opened':
-        this.opened(said.snapshot, said.fresh);
-        break;
-      case 'restored':
-        document.documentElement.dataset['restored'] = 'yes';
-        break;
-      case 'patch':
-        this.stage.patch(said.channel, said.changed, said.level);
-        break;
-      case 'updated':
-        this.updated(said.answer);
-        break;
-      case 'refused':
-        this.refused(said.look, said.code, said.message);
-        break;
       case 'published':
         void this.refreshScans();
         break;
       case 'liveStarted':
-        this.sweep.started(said.grid, this.info === null);
+        this.sweep.started(said.grid, this.pane.info === null);
         break;
       case 'livePicture':
         this.sweep.picture(said.steps, said.texels);
@@ -132,6 +118,8 @@ export class App {
       case 'traffic':
         this.cost.traffic(said.received);
         break;
+      default:
+        this.pane.hear(said);
     }
   }
 
@@ -153,176 +141,89 @@ export class App {
     this.showPins();
   }
 
-  private opened(snapshot: Snapshot, fresh: boolean): void {
-    const framed = fresh && this.info?.id !== snapshot.info.id;
+  private opened(info: ScanInfo, fresh: boolean, framed: boolean): void {
     this.sweep.leave();
-    this.info = snapshot.info;
     this.frame.showEmpty(false);
-    try {
-      this.stage.show(snapshot, framed);
-    } catch (error) {
-      if (!(error instanceof RangeError)) throw error;
-      this.frame.say(strings.tooLarge);
-      return;
-    }
-    if (this.stage.shrunk > 1) this.frame.say(strings.shrunk(this.stage.shrunk));
-    document.documentElement.dataset['scan'] = snapshot.info.id;
     if (!fresh) return;
-    this.scans.mark(snapshot.info.id);
-    this.about.show(snapshot.info);
-    if (framed) this.restoreState(snapshot.info.id);
-    void this.sidecar.open(snapshot.info.id);
-    void this.readWorth(snapshot.info.id);
+    this.scans.mark(info.id);
+    this.about.show(info);
+    if (framed) this.restoreState(info.id);
+    void this.sidecar.open(info.id);
+    void this.readWorth(info.id);
   }
 
   /** What the address asks for, when it is about this scan; else a clean view of it. */
   private restoreState(scan: string): void {
-    const { camera, foveae, pins } = this.state;
     const meant = this.state.scan === scan;
-    this.state = { scan, camera: meant ? camera : null, foveae: [], pins: meant ? pins : [] };
-    if (meant && camera) this.stage.place(camera);
-    this.setMeasured([]);
+    const { camera, foveae, pins } = meant ? this.state : NOWHERE;
+    this.state = { ...NOWHERE, scan, pins };
+    if (camera) this.pane.stage.place(camera);
+    this.measuring.clear();
     this.showPins();
-    this.queue = meant ? foveae : [];
-    this.next();
+    this.pane.sharpenAll(foveae);
     this.writeState();
   }
 
-  private updated(answer: Answer): void {
-    if (answer.reason !== 'superseded') {
-      this.cost.answered(answer);
-      const { dataset } = document.documentElement;
-      dataset['updates'] = String(Number(dataset['updates'] ?? 0) + 1);
-    }
-    if (answer.look !== this.looking?.look) return;
-    if (answer.reason !== 'superseded') this.state.foveae.push(this.looking.place);
-    this.endLook();
-    this.next();
-    this.writeState();
-  }
-
-  private refused(look: number, code: string, message: string): void {
-    if (look === this.looking?.look) this.endLook();
-    if (code === 'not found') {
-      this.frame.showEmpty(this.info === null);
-      if (this.state.scan && !this.info) this.tell({ kind: 'open', scan: 'latest' });
-      this.state.scan = null;
-      return;
-    }
-    this.frame.say(strings.failed(message));
-  }
-
-  private endLook(): void {
-    this.looking = null;
-    this.marks.setBusy(null);
-    document.documentElement.dataset['looking'] = 'no';
+  /** The scan that was asked for is gone: show another one, if there is any. */
+  private missing(): void {
+    this.frame.showEmpty(this.pane.info === null);
+    if (this.state.scan && !this.pane.info) this.pane.open('latest');
+    this.state.scan = null;
   }
 
   /** The picture shows a sweep: nothing that was marked on a scan belongs there. */
   private watched(): void {
     this.frame.showEmpty(false);
-    this.marks.setPins([]);
-    this.marks.setMeasured([], null);
+    this.pane.marks.setPins([]);
+    this.measuring.clear();
   }
 
   private sweepEnded(scan: string | null): void {
     if (scan) this.open(scan);
-    else if (this.info) this.tell({ kind: 'restore' });
+    else if (this.pane.info) this.pane.restore();
   }
 
   // What people do
 
   private open(id: string): void {
-    this.state = { scan: id, camera: null, foveae: [], pins: [] };
-    this.info = null;
-    this.tell({ kind: 'open', scan: id });
+    this.state = { ...NOWHERE, scan: id };
+    this.pane.open(id);
   }
 
-  private listen(): void {
-    listen(this.canvas, {
-      click: (x, y) => this.click(x, y),
-      hover: (x, y) => this.hover(x, y),
-      turn: (across, up) => this.stage.turn(across, up),
-      pan: (right, up) => this.stage.pan(right, up),
-      zoom: (steps) => this.stage.zoom(steps),
-      home: () => this.home(),
-      act: () => this.atMiddle((place) => this.act(place)),
-    });
-    addEventListener('hashchange', () => this.addressChanged());
-    addEventListener('online', () => this.tell({ kind: 'retry' }));
-  }
-
-  private click(x: number, y: number): void {
+  private clicked(place: Place | null): void {
     if (this.sweep.isWatched) return;
-    const place = this.stage.pick(x, y);
-    if (place) this.act(place);
-    else if (this.look.tool !== 'sharpen') this.frame.say(strings.view.missed);
-  }
-
-  private hover(x: number, y: number): void {
-    const place = this.look.follow && !this.sweep.isWatched ? this.stage.pick(x, y) : null;
-    if (place) this.sharpen(place);
-  }
-
-  private atMiddle(act: (place: Place) => void): void {
-    const place = this.sweep.isWatched ? null : this.stage.pickMiddle();
-    if (place) act(place);
-    else this.frame.say(strings.view.missed);
-  }
-
-  private act(place: Place): void {
-    if (this.look.tool === 'measure') this.measure(place);
-    else if (this.look.tool === 'pin') this.pinsPanel.ask(place);
+    const { tool } = this.look;
+    if (place && tool === 'measure') this.measuring.add(place);
+    else if (place && tool === 'pin') this.pinsPanel.ask(place);
     else this.sharpen(place);
   }
 
+  private sharpen(place: Place | null): void {
+    if (this.sweep.isWatched) return;
+    if (place) this.pane.sharpen(place);
+    else this.frame.say(strings.view.missed);
+  }
+
+  private hovered(seek: () => Place | null): void {
+    const place = this.look.follow && !this.sweep.isWatched ? seek() : null;
+    if (place) this.pane.sharpen(place);
+  }
+
   private home(): void {
-    this.stage.frame();
+    this.pane.stage.frame();
     this.writeState();
-  }
-
-  private sharpen(place: Place): void {
-    if (!this.info) return;
-    this.queue = [];
-    this.ask(place);
-  }
-
-  private ask(place: Place): void {
-    const look = ++this.looks;
-    this.looking = { look, place };
-    this.marks.setBusy(place);
-    document.documentElement.dataset['looking'] = 'yes';
-    this.tell({ kind: 'look', look, u: place.u, v: place.v, options: this.look.options });
-  }
-
-  private next(): void {
-    const place = this.queue.shift();
-    if (place) this.ask(place);
   }
 
   private toolChanged(tool: Tool): void {
     this.frame.hintAt(tool);
     if (tool !== 'pin') this.pinsPanel.ask(null);
-    this.setMeasured([]);
+    this.measuring.clear();
     if (tool === 'measure') this.frame.say(strings.measure.first);
   }
 
-  private measure(place: Place): void {
-    this.setMeasured(this.measured.length === 2 ? [place] : [...this.measured, place]);
-    if (this.measured.length === 1) this.frame.say(strings.measure.second);
-  }
-
-  private setMeasured(places: Place[]): void {
-    this.measured = places;
-    const [a, b] = places.map((place) => this.stage.locate(place));
-    const distance = a && b ? a.distanceTo(b) : null;
-    this.marks.setMeasured(places, distance);
-    if (distance !== null) this.frame.say(`${strings.measure.heading}: ${strings.measure.result(distance)}, ${strings.measure.straight}`);
-  }
-
   private goTo(pin: Pin): void {
-    if (!this.info) return;
-    this.stage.face(pin);
+    if (!this.pane.info) return;
+    this.pane.stage.face(pin);
     this.writeState();
   }
 
@@ -347,11 +248,11 @@ export class App {
 
   private showPins(): void {
     this.pinsPanel.show(this.state.pins, this.sidecar.isKept);
-    this.marks.setPins(this.state.pins);
+    this.pane.marks.setPins(this.state.pins);
   }
 
   private async remove(): Promise<void> {
-    const scan = this.info?.id;
+    const scan = this.pane.info?.id;
     if (!scan) return;
     try {
       await deleteScan(scan);
@@ -359,21 +260,19 @@ export class App {
       this.frame.say(strings.failed((error as Error).message));
       return;
     }
-    this.info = null;
     this.sidecar.close();
-    this.stage.clear();
+    this.pane.clear();
+    this.measuring.clear();
     this.about.hide();
     this.worth.hide();
-    this.marks.setPins([]);
-    this.setMeasured([]);
-    this.state = { scan: null, camera: null, foveae: [], pins: [] };
+    this.state = { ...NOWHERE };
     await this.refreshScans();
-    this.tell({ kind: 'open', scan: 'latest' });
+    this.pane.open('latest');
   }
 
   private async readWorth(scan: string): Promise<void> {
     const account = await readAccount(scan).catch(() => null);
-    if (this.info?.id === scan) this.worth.show(account);
+    if (this.pane.info?.id === scan) this.worth.show(account);
   }
 
   private async refreshScans(): Promise<void> {
@@ -398,15 +297,15 @@ export class App {
   private writeState(): void {
     this.writing ??= setTimeout(() => {
       this.writing = undefined;
-      if (!this.info || this.sweep.isWatched) return;
-      const fragment = formatState({ ...this.state, scan: this.info.id, camera: this.stage.placed });
+      const { info, foveae, stage } = this.pane;
+      if (!info || this.sweep.isWatched) return;
+      const fragment = formatState({ ...this.state, scan: info.id, camera: stage.placed, foveae });
       history.replaceState(null, '', `#${fragment}`);
     }, WRITE_MS);
   }
 
   private addressChanged(): void {
     this.state = parseState(location.hash.slice(1));
-    this.info = null;
-    this.tell({ kind: 'open', scan: this.state.scan ?? 'latest' });
+    this.pane.open(this.state.scan ?? 'latest');
   }
 }

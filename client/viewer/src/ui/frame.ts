@@ -1,6 +1,6 @@
 import type { LinkState } from '../link.ts';
 import { strings } from '../strings.ts';
-import { assign, h } from './dom.ts';
+import { h } from './dom.ts';
 
 const NOTICE_MS = 6000;
 
@@ -13,6 +13,8 @@ export interface FrameActions {
 /** What stands round the picture: title and state of the connection above, notices and zoom buttons on it, panels beside. */
 export class Frame {
   readonly stage: HTMLElement;
+  /** Where the pictures stand beside each other. */
+  readonly pictures = h('div', { id: 'pictures' });
   private readonly link = h('p', { id: 'link', role: 'status' }, strings.link.connecting);
   private readonly retry: HTMLButtonElement;
   private readonly notice = h('p', { id: 'notice', role: 'status' });
@@ -22,8 +24,7 @@ export class Frame {
   private retryTimer: ReturnType<typeof setInterval> | undefined;
   private noticeTimer: ReturnType<typeof setTimeout> | undefined;
 
-  constructor(root: HTMLElement, canvas: HTMLCanvasElement, actions: FrameActions) {
-    assign(canvas, { id: 'view', tabindex: 0, role: 'application', 'aria-label': strings.view.label });
+  constructor(root: HTMLElement, actions: FrameActions) {
     const button = (text: string, label: string, act: () => void) =>
       h('button', { type: 'button', class: 'secondary', 'aria-label': label, title: label, click: act }, text);
     const zoom = h('div', { id: 'zoom' },
@@ -31,7 +32,7 @@ export class Frame {
       button('⌂', strings.view.home, () => actions.home()));
     this.retry = h('button', { type: 'button', class: 'secondary', hidden: true, click: () => actions.retry() }, strings.link.again);
     this.stage = h('section', { id: 'stage', 'aria-label': strings.view.label.split('.')[0]! },
-      canvas, this.empty, this.notice, this.hint, zoom);
+      this.pictures, this.empty, this.notice, this.hint, zoom);
     root.append(
       h('header', {}, h('h1', {}, strings.title), h('div', {}, this.link, this.retry)),
       h('main', {}, this.stage, this.panel),

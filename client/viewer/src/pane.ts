@@ -1,0 +1,179 @@
+// One picture with one scan in it: shows what the worker says of it, and asks for detail, one look after the other.
+
+import type { Answer, FromWorker, LookOptions, ToWorker } from './link.ts';
+import type { ScanInfo } from './protocol/messages.ts';
+import { strings } from './strings.ts';
+import { assign, h } from './ui/dom.ts';
+import { listen } from './ui/gestures.ts';
+import { Marks } from './ui/marks.ts';
+import type { Place } from './view/room.ts';
+import { Stage } from './view/stage.ts';
+
+/** What a worker says of the scan it has open. */
+export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'updated' | 'refused' }>;
+
+export interface PaneEvents {
+  say(text: string): void;
+  /** A scan is in the picture. fresh: asked for by us; framed: another than before, with the camera where it sees all. */
+  opened(info: ScanInfo, fresh: boolean, framed: boolean): void;
+  /** A look was answered, not superseded. */
+  updated(answer: Answer): void;
+  /** There is no such scan. */
+  missing(): void;
+  /** Somebody clicked there, or asked for the middle; null: where nothing was measured. */
+  clicked(place: Place | null): void;
+  /** The pointer is there. */
+  hovered(place: () => Place | null): void;
+  home(): void;
+  /** The camera has come to rest, or there is one more fovea: the view is another one. */
+  changed(): void;
+}
+
+export class Pane {
+  readonly element: HTMLElement;
+  readonly stage: Stage;
+  readonly marks: Marks;
+  /** The scan in the picture; null while another one is on its way. */
+  info: ScanInfo | null = null;
+  /** Where detail was got, in order. */
+  foveae: Place[] = [];
+  private looks = 0;
+  private looking: { look: number; place: Place } | null = null;
+  private queue: Place[] = [];
+
+  /** noted: where tests read how things stand. */
+  constructor(
+    private readonly worker: Worker, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
+    private readonly options: () => LookOptions, private readonly events: PaneEvents, private readonly noted: HTMLElement,
+  ) {
+    const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
+    assign(canvas, { tabindex: 0, role: 'application', 'aria-label': strings.view.label });
+    this.element = h('div', { class: 'picture' }, canvas);
+    this.stage = new Stage(canvas, context, {
+      drawn: () => this.marks?.update(),
+      settled: () => this.events.changed(),
+      lost: () => this.events.say(strings.link.graphicsLost),
+      restored: () => this.restore(),
+    }, calm);
+    this.marks = new Marks(this.stage);
+    this.element.append(this.marks.element);
+    listen(canvas, {
+      click: (x, y) => this.events.clicked(this.stage.pick(x, y)),
+      hover: (x, y) => this.events.hovered(() => this.stage.pick(x, y)),
+      turn: (across, up) => this.stage.turn(across, up),
+      pan: (right, up) => this.stage.pan(right, up),
+      zoom: (steps) => this.stage.zoom(steps),
+      home: () => this.events.home(),
+      act: () => this.events.clicked(this.stage.pickMiddle()),
+    });
+  }
+
+  hear(said: OfScan): void {
+    switch (said.kind) {
+      case 'opened':
+        this.opened(said);
+        break;
+      case 'restored':
+        this.noted.dataset['restored'] = 'yes';
+        break;
+      case 'patch':
+        this.stage.patch(said.channel, said.changed, said.level);
+        break;
+      case 'updated':
+        this.updated(said.answer);
+        break;
+      case 'refused':
+        this.refused(said);
+        break;
+    }
+  }
+
+  /** Have another scan opened. */
+  open(scan: string): void {
+    this.info = null;
+    this.tell({ kind: 'open', scan });
+  }
+
+  /** Show again what is held. */
+  restore(): void {
+    this.tell({ kind: 'restore' });
+  }
+
+  /** Show nothing. */
+  clear(): void {
+    this.info = null;
+    this.stage.clear();
+    this.marks.setPins([]);
+  }
+
+  /** Get detail at a place, whatever was asked for before. */
+  sharpen(place: Place): void {
+    if (!this.info) return;
+    this.queue = [];
+    this.ask(place);
+  }
+
+  /** Get detail at places, one after the other. */
+  sharpenAll(places: Place[]): void {
+    this.foveae = [];
+    this.queue = [...places];
+    this.next();
+  }
+
+  private tell(message: ToWorker): void {
+    this.worker.postMessage(message);
+  }
+
+  private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {
+    const framed = fresh && this.info?.id !== snapshot.info.id;
+    this.info = snapshot.info;
+    try {
+      this.stage.show(snapshot, framed);
+    } catch (error) {
+      if (!(error instanceof RangeError)) throw error;
+      this.events.say(strings.tooLarge);
+      return;
+    }
+    if (this.stage.shrunk > 1) this.events.say(strings.shrunk(this.stage.shrunk));
+    this.noted.dataset['scan'] = snapshot.info.id;
+    this.events.opened(snapshot.info, fresh, framed);
+  }
+
+  private updated(answer: Answer): void {
+    const counts = answer.reason !== 'superseded';
+    if (counts) {
+      this.noted.dataset['updates'] = String(Number(this.noted.dataset['updates'] ?? 0) + 1);
+      this.events.updated(answer);
+    }
+    if (answer.look !== this.looking?.look) return;
+    if (counts) this.foveae.push(this.looking.place);
+    this.endLook();
+    this.next();
+    this.events.changed();
+  }
+
+  private refused({ look, code, message }: Extract<OfScan, { kind: 'refused' }>): void {
+    if (look === this.looking?.look) this.endLook();
+    if (code === 'not found') this.events.missing();
+    else this.events.say(strings.failed(message));
+  }
+
+  private ask(place: Place): void {
+    const look = ++this.looks;
+    this.looking = { look, place };
+    this.marks.setBusy(place);
+    this.noted.dataset['looking'] = 'yes';
+    this.tell({ kind: 'look', look, u: place.u, v: place.v, options: this.options() });
+  }
+
+  private next(): void {
+    const place = this.queue.shift();
+    if (place) this.ask(place);
+  }
+
+  private endLook(): void {
+    this.looking = null;
+    this.marks.setBusy(null);
+    this.noted.dataset['looking'] = 'no';
+  }
+}
