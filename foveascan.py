@@ -15,7 +15,7 @@ What holds for every subcommand:
 - A program that runs until it is told to stop prints {"ready": true, ...} with --json once it is ready, and nothing
   more there, since whoever started it reads no further. It ends cleanly with status 0 on SIGTERM and SIGINT.
 - Failure is raised, not printed: FoveascanError and OSError become one line on standard error here, "foveascan: ...",
-  so their message names the cure. Anything else is a bug, and shows its traceback.
+  so their message names the cure; UsageError is status 2. Anything else is a bug, and shows its traceback.
 
 Exit status: 0 done; 1 failed; 2 wrong usage; 130 interrupted; 141 whoever read standard output went away.
 """
@@ -34,13 +34,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import MappingProxyType
+from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any
 
 import client.command
 import node.command
 import simulators.command
-from protocol.errors import FoveascanError
+from protocol.errors import FoveascanError, UsageError
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ TRUTH, CLOSED = "truth.npz", "closed.npz"
 END_S = 5.0  # what a program may take to end after SIGTERM
 
 FAILED = 1
+WRONG_USAGE = 2  # argparse's own
 INTERRUPTED = 130
 READER_GONE = 141
 
@@ -75,6 +76,7 @@ CURES = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand and return its exit status; `argv` defaults to the command line."""
+    _hush_codecs()
     try:
         try:
             args = build_parser().parse_args(argv)
@@ -89,7 +91,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return READER_GONE
     except (FoveascanError, OSError) as problem:
         print(f"foveascan: {one_line(problem)}", file=sys.stderr)
-        return FAILED
+        return WRONG_USAGE if isinstance(problem, UsageError) else FAILED
+
+
+class EndedEarly(FoveascanError):
+    """A program that we started ended before it was ready. status : its own; below 0 by that signal."""
+
+    def __init__(self, name: str, status: int) -> None:
+        super().__init__(f"{name} ended with status {status} before it was ready")
+        self.status = status
 
 
 class _Parser(argparse.ArgumentParser):
@@ -150,7 +160,17 @@ def run_no_bench(args: argparse.Namespace) -> int:
 
 def run_demo(args: argparse.Namespace) -> int:
     """Simulated scanner and node as processes of their own, one sweep, then serve until a signal, or look and end."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # so that both programs are ended with the blocks below
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: sys.exit(0))  # so that both programs are ended with the blocks below
+    try:
+        return _demo(args)
+    except EndedEarly as ended:
+        if ended.status < 0:
+            raise
+        return ended.status  # it has said why, on our standard error
+
+
+def _demo(args: argparse.Namespace) -> int:
     with TemporaryDirectory(prefix="foveascan-demo-") as folder:
         with started(*_simulate(args, folder)) as (_, scanner):
             with started(*_serve(scanner["path"], folder)) as (node, ready):
@@ -253,12 +273,14 @@ def started(
 ) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any]]]:
     """Another subcommand (given --json) as a process, with the line that says it is ready; ended with the block.
 
-    environment : what its environment has beside ours.
-    Raises FoveascanError when it ends, or says anything else, before it is ready.
+    environment : what its environment has beside ours.  Ctrl-C reaches us alone, so that programs end in their order.
+    Raises EndedEarly when it ends before it is ready, FoveascanError when it says anything else.
     """
     all_of_it = {**os.environ, **environment}
     command = [*PROGRAM, *arguments]
-    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, env=all_of_it) as program:
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, env=all_of_it, process_group=0
+    ) as program:
         try:
             yield program, _ready_line(program, arguments[0])
         finally:
@@ -269,7 +291,7 @@ def _ready_line(program: subprocess.Popen[bytes], name: str) -> dict[str, Any]:
     assert program.stdout is not None
     line = program.stdout.readline(READY_LINE_MAX_BYTES)
     if not line:
-        raise FoveascanError(f"{name} ended with status {program.wait()} before it was ready: see its message above")
+        raise EndedEarly(name, program.wait())
     try:
         ready: dict[str, Any] = json.loads(line)
     except ValueError as problem:
@@ -298,6 +320,22 @@ def _what(problem: Exception) -> str:
         place = f"{os.fsdecode(problem.filename)}: " if isinstance(problem.filename, str | bytes) else ""
         return f"{place}{problem.strerror}"
     return str(problem) or type(problem).__name__
+
+
+def _hush_codecs() -> None:
+    """Print nothing of what imagecodecs drops half way through a damaged image: a CodecError says it."""
+    if sys.unraisablehook is not sys.__unraisablehook__:  # somebody else's already, or ours
+        return
+
+    def dropped(what: sys.UnraisableHookArgs) -> None:
+        if not str(what.object).startswith("imagecodecs."):
+            sys.__unraisablehook__(what)
+
+    def uncaught(kind: type[BaseException], problem: BaseException, trace: TracebackType | None) -> None:
+        if str(problem) != "ojph error":
+            sys.__excepthook__(kind, problem, trace)
+
+    sys.unraisablehook, sys.excepthook = dropped, uncaught
 
 
 def _forget_stdout() -> None:

@@ -14,7 +14,7 @@ from client.arguments import add_closing, add_node, chosen_node, number, positiv
 from protocol.printable import printable
 
 if TYPE_CHECKING:
-    from client.transfer import Moved
+    from client.transfer import Moved, Sent
     from exchange.formats import ReadOptions, Size
     from exchange.native import Scanned
 
@@ -64,13 +64,15 @@ def run_import(args: argparse.Namespace) -> int:
         found = read_scan(args.file, args.texture, options, lambda share: moved(round(1000 * share), 1000))
     found = found._replace(name=args.name or found.name)
     spec = found.grid.spec
+    record: dict[str, object]
     if args.output:
         _write(args.output, found)
         record = {"file": str(args.output)}
         line = f"{args.output}: {spec.geometry}, {spec.width} x {spec.height}"
     else:
-        scan = asyncio.run(_import(args, found))
-        record, line = {"scan": scan}, f"scan {scan}"
+        sent = asyncio.run(_import(args, found))
+        record = {"scan": sent.scan, "new": sent.is_new}
+        line = f"scan {sent.scan}{'' if sent.is_new else ', which the node had already; it is the newest now'}"
     record |= {"geometry": spec.geometry, "note": found.note}
     print(json.dumps(record) if args.json else "\n".join(filter(None, (line, printable(found.note)))), flush=True)
     return 0
@@ -84,7 +86,7 @@ async def _export(args: argparse.Namespace) -> int:
         return await fetch_scan(node, args.scan, args.file, token=args.token, moved=moved)
 
 
-async def _import(args: argparse.Namespace, found: Scanned) -> str:
+async def _import(args: argparse.Namespace, found: Scanned) -> Sent:
     import tempfile
 
     from client.transfer import send_scan

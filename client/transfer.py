@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import aiohttp
 
@@ -18,6 +18,7 @@ from exchange.whole_file import whole_file
 from protocol.errors import RemoteWireError
 
 CHUNK_BYTES = 1 << 18
+CREATED = 201
 TIMEOUT = aiohttp.ClientTimeout(total=None, sock_connect=10, sock_read=600)  # a node writes a file before it sends it
 
 Moved = Callable[[int, int | None], object]
@@ -43,8 +44,15 @@ async def fetch_scan(
             return file.tell()
 
 
-async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> str:
-    """Add a native grid (.npz, open at its start) to a node's library. Returns the scan's id.
+class Sent(NamedTuple):
+    """A scan that a node has taken. is_new : it had no such scan before."""
+
+    scan: str
+    is_new: bool
+
+
+async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> Sent:
+    """Add a native grid (.npz, open at its start) to a node's library.
 
     Raises what `connect` raises; then the node has nothing of it.
     """
@@ -61,7 +69,7 @@ async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | Non
         said = reply(response.status, await bounded_body(response))
     if not isinstance(said, dict) or not isinstance(said.get("id"), str):
         raise RemoteWireError("the node took the scan and did not say its id")
-    return str(said["id"])
+    return Sent(str(said["id"]), response.status == CREATED)
 
 
 @asynccontextmanager

@@ -8,7 +8,6 @@ the port is opened, so a scanner is found again under whatever name it comes bac
 from __future__ import annotations
 
 import os
-import re
 import select
 import socket
 import threading
@@ -22,6 +21,7 @@ import usb.backend.libusb1
 import usb.core
 from serial.tools import list_ports
 
+from drivers.address import parse_ids
 from drivers.port import Port
 from drivers.serial_port import SerialPort
 from drivers.sweep import ScannerConfig
@@ -32,7 +32,6 @@ from protocol.framing import USB_PAYLOAD_MAX
 
 SCANNER_IDS = ((0x1209, 0x5CA1),)
 USB_WINDOW_BYTES = 1 << 20
-_SERIAL = re.compile("serial:([0-9a-fA-F]{1,4}):([0-9a-fA-F]{1,4})(?::(.+))?")
 _BY_ID = Path("/dev/serial/by-id")
 _LOOKED_AT = ("/dev/serial/by-id", "/dev/bus/usb", "/dev")
 _POLL_S = 0.25
@@ -183,12 +182,12 @@ def _text(device: Any, name: str) -> str:
 
 def _serial_path(address: str) -> str:
     """The serial port that an address leads to now. Raises PortLost."""
-    match = _SERIAL.fullmatch(address)
-    if match is None:
-        raise PortLost(f"{address!r} is not serial:VENDOR:PRODUCT or serial:VENDOR:PRODUCT:SERIAL, ids in hexadecimal")
-    wanted = int(match[1], 16), int(match[2], 16)
-    ports = [port for port in _serial_ports() if (port.vendor, port.product) == wanted]
-    chosen = [port.address for port in ports if match[3] in (None, port.serial_number)]
+    try:
+        vendor, product, serial_number = parse_ids("serial", address)
+    except ValueError as error:
+        raise PortLost(str(error)) from error
+    ports = [port for port in _serial_ports() if (port.vendor, port.product) == (vendor, product)]
+    chosen = [port.address for port in ports if serial_number in (None, port.serial_number)]
     if not chosen:
         others = f"; {len(ports)} of this kind with other serial numbers are" if ports else ""
         raise PortLost(f"{address}: no such serial port is connected{others}")

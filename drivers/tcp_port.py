@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 import select
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+from drivers.address import parse_tcp
 from protocol.errors import PortLost
 
 _CONNECT_S = 2.0
 _WRITE_TIMEOUT_S = 2.0
-_ADDRESS = re.compile(r"tcp:(?:\[([0-9A-Fa-f:.%\w]+)\]|([^\s:\[\]/]{1,253})):([0-9]{1,5})")
-
-
-def parse_tcp(address: str) -> tuple[str, int]:
-    """Host and port of tcp:HOST:PORT or tcp:[IPv6]:PORT. Raises ValueError."""
-    match = _ADDRESS.fullmatch(address)
-    if match is None or not 1 <= int(match[3]) <= 65535:
-        raise ValueError(f"{address!r} is not tcp:HOST:PORT or tcp:[IPv6]:PORT")
-    return match[1] or match[2], int(match[3])
 
 
 class TcpPort:

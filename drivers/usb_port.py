@@ -8,7 +8,6 @@ where they end.
 from __future__ import annotations
 
 import errno
-import re
 import threading
 from array import array
 from collections import deque
@@ -21,6 +20,7 @@ import usb.backend.libusb1
 import usb.core
 import usb.util
 
+from drivers.address import parse_ids
 from protocol.errors import PortLost
 
 READ_BYTES = 262_144
@@ -28,7 +28,6 @@ _WAITING_BYTES_MAX = 4 * READ_BYTES
 _READ_MS = 100  # how long a thread that shall end may go on waiting
 _WRITE_MS = 2000
 _STALLS_MAX = 5  # in a row
-_ADDRESS = re.compile("usb:([0-9a-fA-F]{1,4}):([0-9a-fA-F]{1,4})(?::(.+))?")
 _RULE = (
     'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{:04x}", ATTR{{idProduct}}=="{:04x}", MODE="0660", GROUP="foveascan"'
     " in /etc/udev/rules.d/70-foveascan.rules"
@@ -47,10 +46,7 @@ class UsbAddress:
     @classmethod
     def parse(cls, text: str) -> UsbAddress:
         """From "usb:VID:PID" or "usb:VID:PID:SERIAL", ids in hexadecimal. Raises ValueError."""
-        match = _ADDRESS.fullmatch(text)
-        if match is None:
-            raise ValueError(f"{text!r} is not usb:VENDOR:PRODUCT or usb:VENDOR:PRODUCT:SERIAL, ids in hexadecimal")
-        return cls(int(match[1], 16), int(match[2], 16), match[3])
+        return cls(*parse_ids("usb", text))
 
     def __str__(self) -> str:
         tail = f":{self.serial_number}" if self.serial_number else ""

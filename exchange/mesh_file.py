@@ -22,6 +22,7 @@ FILE_BYTES_MAX = 1 << 30
 JSON_BYTES_MAX = 1 << 26
 FACES_MAX = 20_000_000
 GREY = 128
+NO_MESH = "is no {} file, or damaged: open it in the program that wrote it, and export it anew"
 MM_PER_M = 1000.0
 
 # Rows: where x, y and z of the turntable come from.
@@ -88,12 +89,14 @@ def _load(path: Path) -> list[tuple[Solid, FloatArray]]:
     except OSError:
         raise
     except Exception as problem:  # readers of a dozen formats raise whatever comes to their mind over bad bytes
-        raise ExchangeError(f"{path}: no mesh we can read: {type(problem).__name__}: {problem}") from problem
+        raise ExchangeError(f"{path}: {NO_MESH.format(path.suffix.lower())}") from problem
     placed = [(scene.geometry[name], np.asarray(matrix, np.float64)) for matrix, name in nodes]
     found = [(solid, matrix) for solid, matrix in placed if isinstance(solid, Solid) and _size(solid)]
     size = sum(_size(solid) for solid, _ in found)
-    if not 0 < size <= FACES_MAX:
-        raise ExchangeError(f"{path}: {size} faces or points, expected 1 to {FACES_MAX}")
+    if not size:
+        raise ExchangeError(f"{path}: has no faces and no points, so it is empty or damaged")
+    if size > FACES_MAX:
+        raise ExchangeError(f"{path}: {size} faces or points, at most {FACES_MAX}")
     return found
 
 
@@ -158,7 +161,7 @@ def _image(visual: Any) -> ImageArray | None:
     try:
         return np.asarray(picture.convert("RGB"))
     except (OSError, ValueError, SyntaxError) as problem:
-        raise ExchangeError(f"texture: {problem}") from problem
+        raise ExchangeError(f"texture: a damaged image of {picture.width} x {picture.height} texels") from problem
 
 
 def _corner_colours(visual: Any, faces: Any) -> Any:
@@ -203,7 +206,7 @@ def _check_gltf(path: Path) -> None:
             if not 0 <= int(accessor["count"]) <= 3 * FACES_MAX:
                 raise ExchangeError(f"{path}: accessors[{number}].count: {accessor['count']}, at most {3 * FACES_MAX}")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, struct.error) as problem:
-        raise ExchangeError(f"{path}: no glTF: {type(problem).__name__}: {problem}") from problem
+        raise ExchangeError(f"{path}: {NO_MESH.format(path.suffix.lower())}") from problem
 
 
 def _gltf_json(path: Path) -> bytes:

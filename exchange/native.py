@@ -79,7 +79,7 @@ def read_native(
         with zipfile.ZipFile(file) as archive:
             return _read(_Members(archive, array_bytes_max), texture)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as problem:
-        raise ExchangeError(f"no .npz grid: {problem}") from problem
+        raise ExchangeError("is no .npz file, or damaged: copy or export it anew") from problem
     except OSError as problem:
         if problem.errno != errno.EINVAL:  # which a directory of made-up offsets earns, where it seeks before the file
             raise
@@ -106,7 +106,7 @@ class _Members:
             try:
                 shape, fortran, found = _header(member)  # type: ignore[arg-type]  # numpy types a file wider than it reads
             except ValueError as problem:
-                raise ExchangeError(f"{key}: {problem}") from None
+                raise ExchangeError(f"{key}: is no array in the .npy format, or damaged") from problem
             if not issubclass(found.type, kinds) or len(shape) != dimensions:
                 expected = f"{dimensions} dimensions of {' or '.join(kind.__name__ for kind in kinds)}"
                 raise ExchangeError(f"{key}: expected {expected}, got {found}{list(shape)}")

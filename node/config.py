@@ -17,7 +17,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from protocol.errors import ConfigError
+from drivers.address import check_address
+from protocol.errors import ConfigError, UsageError
 
 FILE_MAX_BYTES = 65536
 DNS_LABEL_MAX_BYTES = 63
@@ -55,6 +56,12 @@ class Capture(Struct, frozen=True, forbid_unknown_fields=True):
     overlap: Annotated[int, Meta(ge=0, le=255)] = 0  # [1/256 turn] seen again at the end, to tell noise and slip
     stride: Annotated[int, Meta(ge=1, le=255)] = 1  # >1: a fast turn with every so many-th column comes first
     repair: bool = True  # take spikes out and fill holes of up to 3 cells; a scan keeps what was measured there
+
+    def __post_init__(self) -> None:
+        try:
+            check_address(self.scanner or "")
+        except ValueError as problem:
+            raise ValueError(f"scanner: {problem}") from None
 
 
 class Server(Struct, frozen=True, forbid_unknown_fields=True):
@@ -188,16 +195,18 @@ def load_config(path: Path | None = None, overrides: Mapping[str, object] | None
     """Settings from a TOML file (none: the defaults), then from `overrides`, which win.
 
     overrides : {"server.listen": "127.0.0.1:0", ...}, as a command line gives them; None there means "not given".
-    Raises ConfigError for a file that cannot be read or is no TOML, and for a setting that is unknown or out of bounds.
+    Raises ConfigError for a file that cannot be read or is no TOML, and for a setting that is unknown or out of bounds;
+    UsageError where an override set it.
     """
     settings = _read_toml(path) if path else {}
-    for place, value in (overrides or {}).items():
-        if value is not None:
-            _set(settings, place, value)
+    given = {place: value for place, value in (overrides or {}).items() if value is not None}
+    for place, value in given.items():
+        _set(settings, place, value)
     try:
         return msgspec.convert(settings, Config)
     except msgspec.ValidationError as problem:
-        raise ConfigError(_in_our_words(str(problem))) from None
+        what = _in_our_words(str(problem))
+        raise (UsageError if what.partition(":")[0] in given else ConfigError)(what) from None
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

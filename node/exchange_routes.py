@@ -67,10 +67,12 @@ class ExchangeRoutes:
             with spool(self._exhibits.library.folder) as file:
                 await _receive(request, file)
                 found = await asyncio.to_thread(_read, file)
+            before = {scan.id for scan in self._exhibits.library.scans()}
             scan = await self._keep(found)
         request[SCAN] = scan.id
         self._published(scan.id)
-        return web.Response(body=msgspec.json.encode({"id": scan.id}), content_type="application/json", status=201)
+        body, status = msgspec.json.encode({"id": scan.id}), 200 if scan.id in before else 201
+        return web.Response(body=body, content_type="application/json", status=status)
 
     async def _keep(self, found: Scanned) -> Scan:
         about = About(time.time(), "import", found.name, note=found.note)

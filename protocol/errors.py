@@ -13,6 +13,7 @@ FoveascanError
 ├── AccessError          who may come in: a certificate, token or code that cannot be read, written or found
 ├── InstallError         the service cannot be installed, updated or removed
 └── ConfigError          a setting with a wrong type, an unknown key or a value out of bounds (also a ValueError)
+    └── UsageError       one that the command line gave
 """
 
 
@@ -66,3 +67,7 @@ class InstallError(FoveascanError):
 
 class ConfigError(FoveascanError, ValueError):
     """A setting with a wrong type, an unknown key or a value out of bounds."""
+
+
+class UsageError(ConfigError):
+    """A value on the command line that makes no sense."""

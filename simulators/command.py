@@ -97,7 +97,7 @@ def run_simulate(args: argparse.Namespace) -> int:
 
 
 def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
-    """The scanner asked for, with its faults. Raises ConfigError."""
+    """The scanner asked for, with its faults. Raises UsageError."""
     from protocol.framing import SERIAL_PAYLOAD_MAX, USB_PAYLOAD_MAX
     from protocol.scanner_messages import Order
     from simulators.faults import FaultyScanner, parse_faults

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from protocol.errors import ConfigError
+from protocol.errors import UsageError
 from protocol.framing import FRAME_OVERHEAD, encode_frame
 from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepHeader, TextureColumn
 from simulators.flaws import Flaws
@@ -66,7 +66,7 @@ FAULT_NAMES = tuple(field.name for field in fields(Faults)) + tuple(_FLAW_NAMES)
 def parse_faults(text: str, seed: int = 0) -> tuple[Faults, Flaws]:
     """What "loss=0.01,spikes=0.001" asks for: faults of line and device, flaws of table and cameras.
 
-    Raises ConfigError for a name or a number that makes no sense.
+    Raises UsageError for a name or a number that makes no sense.
     """
     faults, flaws = Faults(), Flaws(seed=seed)
     for item in filter(None, text.split(",")):
@@ -79,7 +79,7 @@ def parse_faults(text: str, seed: int = 0) -> tuple[Faults, Flaws]:
         elif name in FAULT_NAMES:
             faults = dataclasses.replace(faults, **{name: value})
         else:
-            raise ConfigError(f"faults: {name!r} is none of {', '.join(FAULT_NAMES)}")
+            raise UsageError(f"faults: {name!r} is none of {', '.join(FAULT_NAMES)}")
     return faults, flaws
 
 
@@ -87,9 +87,9 @@ def _number(name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise ConfigError(f"faults: {name}={text!r} is no number") from None
+        raise UsageError(f"faults: {name}={text!r} is no number") from None
     if not 0 <= value < math.inf:
-        raise ConfigError(f"faults: {name}={text} is below 0 or endless")
+        raise UsageError(f"faults: {name}={text} is below 0 or endless")
     return value
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from exchange.formats import SIZES, ReadOptions, read_scan
 from exchange.unrolling import unroll
-from protocol.errors import ConfigError
+from protocol.errors import UsageError
 from protocol.grid import VOID, Grid, ImageArray, StepArray
 from simulators import shapes
 from simulators.head import head
@@ -79,22 +79,22 @@ def make_specimen(
     size : S, M or L, of a generated specimen or of the grid a mesh is cast on; other files have their own.
     seed : what a generated specimen is drawn from.
     texture_path : image of a file's texture (any format OpenCV reads); for files only.
-    Raises ConfigError for an unknown name or size, ExchangeError for a file that is no scan, OSError for one that
+    Raises UsageError for an unknown name or size, ExchangeError for a file that is no scan, OSError for one that
     cannot be opened.
     """
     if size not in SIZES:
-        raise ConfigError(f"size: {size} is none of {', '.join(SIZES)}")
+        raise UsageError(f"size: {size} is none of {', '.join(SIZES)}")
     generate = GENERATORS.get(str(name_or_path))
     if generate is None:
         return _from_file(Path(name_or_path), size, None if texture_path is None else Path(texture_path))
     if texture_path is not None:
-        raise ConfigError(f"texture: {name_or_path} brings its own; --texture goes with a file")
+        raise UsageError(f"texture: {name_or_path} brings its own; --texture goes with a file")
     return _standing(str(name_or_path), generate(SIZES[size], seed))
 
 
 def _from_file(path: Path, size: str, texture_path: Path | None) -> Specimen:
     if not path.suffix and not path.exists():
-        raise ConfigError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no file")
+        raise UsageError(f"specimen: {path} is none of {', '.join(GENERATORS)} and no file")
     as_it_is = path.suffix.lower() == ".npz"
     found = read_scan(path, texture_path, ReadOptions(SIZES[size], geometry=None if as_it_is else "cylinder"))
     return _standing(found.name, found.grid)

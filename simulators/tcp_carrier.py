@@ -9,17 +9,17 @@ import socket
 import time
 from contextlib import suppress
 
-from protocol.errors import ConfigError
+from protocol.errors import UsageError
 
 _CATCH_UP_S = 0.02
 _LISTEN = re.compile(r"(?:(?:\[([0-9A-Fa-f:.]+)\]|([^\s:\[\]/]+)):)?([0-9]{1,5})")
 
 
 def parse_listen(text: str) -> tuple[str, int]:
-    """Where to listen: PORT, on this machine alone, or HOST:PORT. Port 0: any free one. Raises ConfigError."""
+    """Where to listen: PORT, on this machine alone, or HOST:PORT. Port 0: any free one. Raises UsageError."""
     match = _LISTEN.fullmatch(text)
     if match is None or int(match[3]) > 65535:
-        raise ConfigError(f"path: expected PORT or HOST:PORT to listen at, got {text!r}")
+        raise UsageError(f"path: expected PORT or HOST:PORT to listen at, got {text!r}")
     return match[1] or match[2] or "127.0.0.1", int(match[3])
 
 

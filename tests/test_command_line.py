@@ -62,6 +62,42 @@ def test_wrong_usage_is_status_2_and_a_hint(arguments: tuple[str, ...]) -> None:
     assert "usage: foveascan" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (("library", "prune", "--max-age-days", "0"), "retention.max_age_days: expected float >= 1.0"),
+        (("serve", "--check", "--scanner", "tcp:foo"), "capture.scanner: 'tcp:foo' is not tcp:HOST:PORT or"),
+        (("serve", "--check", "--scanner", "usb:12"), "capture.scanner: 'usb:12' is not usb:VENDOR:PRODUCT or"),
+        (("serve", "--check", "--listen", "7345"), "server.listen: expected HOST:PORT or [IPv6]:PORT"),
+        (("simulate", "--path", "p", "--faults", "nope=1"), "faults: 'nope' is none of loss,"),
+        (("simulate", "--path", "99999", "--link", "tcp"), "path: expected PORT or HOST:PORT"),
+        (("simulate", "--path", "p", "--specimen", "nothing"), "specimen: nothing is none of"),
+        (("demo", "--specimen", "nothing"), "specimen: nothing is none of"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_status_2_and_one_line(arguments: tuple[str, ...], hint: str) -> None:
+    done = foveascan_process(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"foveascan: {hint}") and done.stderr.count("\n") == 1
+
+
+def test_a_damaged_image_is_an_error_and_no_noise() -> None:
+    code = """
+import sys, foveascan, numpy
+from protocol.codec_htj2k import CodecError, decode, encode
+foveascan._hush_codecs()
+coded = bytearray(encode(numpy.random.default_rng(1).integers(0, 255, (64, 64, 3), numpy.uint8), 255))
+for at in range(10, 300, 10):
+    coded[at] ^= 0xFF
+    try:
+        decode(bytes(coded), (64, 64, 3), 255)
+    except CodecError:
+        print("found")
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (told.returncode, told.stderr) == (0, "") and "found" in told.stdout
+
+
 def test_the_status_of_a_subcommand_is_the_status_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     offer(monkeypatch, lambda args: 7)
     assert foveascan.main(["try"]) == 7

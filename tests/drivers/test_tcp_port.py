@@ -7,8 +7,9 @@ from contextlib import closing
 
 import pytest
 
+from drivers.address import parse_tcp
 from drivers.discover import config_for, open_port
-from drivers.tcp_port import TcpPort, parse_tcp
+from drivers.tcp_port import TcpPort
 from protocol.errors import ConfigError, PortLost
 from protocol.framing import USB_PAYLOAD_MAX
 from simulators.tcp_carrier import TcpListener, parse_listen

@@ -129,13 +129,13 @@ def test_a_reader_with_less_room_says_so() -> None:
 
 @pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x03\x04 not really"])
 def test_garbage_is_refused(content: bytes) -> None:
-    with pytest.raises(ExchangeError, match=r"no \.npz grid"):
+    with pytest.raises(ExchangeError, match=r"is no \.npz file, or damaged"):
         read_native(io.BytesIO(content))
 
 
 @pytest.mark.parametrize("cut", [1, 40, 300])
 def test_a_cut_file_is_refused(cut: int) -> None:
-    with pytest.raises(ExchangeError, match=r"no \.npz grid"):
+    with pytest.raises(ExchangeError, match=r"is no \.npz file, or damaged"):
         read_native(io.BytesIO(packed(texture=TEXTURE).getvalue()[:-cut]))
 
 
@@ -144,5 +144,5 @@ def test_a_rotten_byte_is_refused() -> None:
     write_native(vase(), file)
     data = bytearray(file.getvalue())
     data[data.index(b"depth_u16.npy") + 900] ^= 1
-    with pytest.raises(ExchangeError, match="CRC"):
+    with pytest.raises(ExchangeError, match="damaged"):
         read_native(io.BytesIO(data))

@@ -92,13 +92,14 @@ async def test_what_goes_out_and_in_is_the_same_scan(tmp_path: Path) -> None:
         scan = exhibits.library.add(vase(holes=True), About(0.0, name="vase"))
         body = await (await client.get(f"/v1/scans/{scan.id}.npz")).read()
         answer = await client.post("/v1/scans", data=body)
-        assert answer.status == 201 and await answer.json() == {"id": scan.id} and published == [scan.id]
+        assert answer.status == 200 and await answer.json() == {"id": scan.id} and published == [scan.id]
         assert read_native(io.BytesIO(body))[1].spec == scan.spec
 
 
 async def test_an_imported_grid_is_kept_and_published(tmp_path: Path) -> None:
     async with serving(tmp_path) as (client, exhibits, published):
         answer = await client.post("/v1/scans", data=native(vase(), "a vase"))
+        assert answer.status == 201
         scan = exhibits.library.open((await answer.json())["id"])
         assert scan.id == content_id(vase()) and published == [scan.id]
         assert (scan.about.source, scan.about.name) == ("import", "a vase")
@@ -108,10 +109,10 @@ async def test_an_imported_grid_is_kept_and_published(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "status", "message"),
     [
-        (b"", 422, "no .npz grid"),
-        (b"garbage", 422, "no .npz grid"),
-        (native(vase())[:-1000], 422, "no .npz grid"),
-        (b"PK\x03\x04" + bytes(100), 422, "no .npz grid"),
+        (b"", 422, "is no .npz file, or damaged"),
+        (b"garbage", 422, "is no .npz file, or damaged"),
+        (native(vase())[:-1000], 422, "is no .npz file, or damaged"),
+        (b"PK\x03\x04" + bytes(100), 422, "is no .npz file, or damaged"),
     ],
 )
 async def test_what_is_no_grid_is_refused_and_leaves_nothing(

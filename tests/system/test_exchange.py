@@ -83,7 +83,7 @@ def test_a_mesh_goes_in_and_comes_out(tmp_path: Path, capsys: pytest.CaptureFixt
         assert run("import", str(ball), "--size", "72x40:128x64", "--node", url, "--json") == 0
         (scan,) = library.scans()
         note = "a closed mesh seen from a centre at 0.0 mm"
-        said = {"scan": scan.id, "geometry": "sphere", "note": note}
+        said = {"scan": scan.id, "new": True, "geometry": "sphere", "note": note}
         assert json.loads(capsys.readouterr().out) == said
         assert (scan.about.name, scan.about.note) == ("ball", note)
         assert run("export", str(tmp_path / "out.stl"), "--node", url, "--scan", scan.id, "--json") == 0
@@ -98,7 +98,7 @@ def test_a_grid_goes_round_without_a_change(tmp_path: Path, capsys: pytest.Captu
         scan = library.add(vase(holes=True), About(0.0, name="vase"))
         assert run("export", str(tmp_path / "vase.npz"), "--node", url) == 0
         assert run("import", str(tmp_path / "vase.npz"), "--node", f"{url}/", "--name", "again") == 0
-        assert capsys.readouterr().out.endswith(f"scan {scan.id}\n")
+        assert capsys.readouterr().out.endswith(f"scan {scan.id}, which the node had already; it is the newest now\n")
         assert [kept.about.name for kept in library.scans()] == ["again"]
 
 

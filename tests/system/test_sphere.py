@@ -109,7 +109,7 @@ def bring(url: str, name: str) -> str:
     file = io.BytesIO()
     write_native(scan_of(*SCANS[name]), file, name)
     file.seek(0)
-    return asyncio.run(send_scan(url, file, moved=lambda done, total: None))
+    return asyncio.run(send_scan(url, file, moved=lambda done, total: None)).scan
 
 
 def left_in_cap(

@@ -52,7 +52,7 @@ def bring(url: str, turn: FloatArray) -> str:
     file = io.BytesIO()
     write_native(grid_of(turn), file, "lumpy")
     file.seek(0)
-    return asyncio.run(send_scan(url, file, moved=lambda done, total: None))
+    return asyncio.run(send_scan(url, file, moved=lambda done, total: None)).scan
 
 
 def _own(width: int, height: int, turn: FloatArray) -> FloatArray:
