@@ -25,9 +25,9 @@ class _Track:
 
     def piece_of(self, column: Column) -> int | None:
         """Index into `held`, or None where such a piece does not exist in this sweep."""
-        piece, beside = divmod(column.row0, self.piece_rows)
-        fits = column.column < self.columns and beside == 0 and piece < self.pieces
-        if not fits or column.rows != min(self.piece_rows, self.rows - column.row0):
+        row0 = column.row0
+        piece, beside = divmod(row0, self.piece_rows)
+        if beside or column.column >= self.columns or column.rows != min(self.piece_rows, self.rows - row0):
             return None
         return column.column * self.pieces + piece
 
@@ -65,7 +65,8 @@ class Ledger:
             self.duplicates += 1
             return False
         track.held[piece] = 1
-        track.newest = max(track.newest, column.column)
+        if column.column > track.newest:
+            track.newest = column.column
         self.held += 1
         self.digest = (self.digest + column.checksum) % 2**32
         return True

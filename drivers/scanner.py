@@ -58,6 +58,7 @@ from protocol.scanner_messages import (
 )
 
 _READ_BYTES = 262_144
+_COLUMNS = (RangeColumn, TextureColumn)
 _LOOK_UP_S = 0.1  # how long a wait for bytes may keep us from the stop flag
 
 __all__ = [
@@ -166,16 +167,20 @@ class Scanner:
         return Collector(self._greeted, header, self._config, is_live, self._clock())
 
     def _collect(self, collector: Collector, stop: threading.Event) -> Iterator[SweepEvent]:
-        """Columns and progress until the sweep is over."""
+        """Columns and progress until the sweep is over; what is due is looked up once for all that one read brought."""
+        link = self._greeted
         try:
             while not collector.is_over:
-                event = self._next_event(self._clock() + _LOOK_UP_S)
-                if isinstance(event, RangeColumn | TextureColumn):
+                event = link.next_event()
+                if isinstance(event, _COLUMNS):
                     if collector.take_column(event):
                         yield event
                 elif event is not None:
                     yield from self._answering(collector.take(event))
-                yield from self._answering(collector.look_up(self._clock(), stop.is_set(), self._silence_s()))
+                else:
+                    yield from self._answering(collector.look_up(self._clock(), stop.is_set(), self._silence_s()))
+                    if not collector.is_over:
+                        self._await_bytes(self._clock() + _LOOK_UP_S)
         except PortLost as error:
             yield collector.interrupt(str(error), error)
         finally:
@@ -268,14 +273,15 @@ class Scanner:
     def _next_event(self, until_s: float) -> Event | None:
         """The next event of the link, or None when none came in time. Raises PortLost."""
         link = self._greeted
-        while (event := link.next_event()) is None:
-            self._flush()
-            now_s = self._clock()
-            if now_s >= until_s:
-                break
-            self._read(min(until_s, link.next_deadline() or until_s) - now_s)
+        while (event := link.next_event()) is None and self._clock() < until_s:
+            self._await_bytes(until_s)
         self._flush()
         return event
+
+    def _await_bytes(self, until_s: float) -> None:
+        """Write what is to be written, and wait for bytes, or until the link has something to do. Raises PortLost."""
+        self._flush()
+        self._read(min(until_s, self._greeted.next_deadline() or until_s) - self._clock())
 
     def _read(self, timeout_s: float) -> None:
         """Wait for bytes and hand them to the link."""

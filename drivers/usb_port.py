@@ -25,6 +25,8 @@ from protocol.errors import PortLost
 
 READ_BYTES = 262_144
 _WAITING_BYTES_MAX = 4 * READ_BYTES
+_GATHER_S = 0.008  # what follows on a piece of a sweep within this time is taken with it: fewer wake-ups
+_GATHER_FROM_BYTES = 16384  # less is an answer, which somebody waits for
 _READ_MS = 100  # how long a thread that shall end may go on waiting
 _WRITE_MS = 2000
 _STALLS_MAX = 5  # in a row
@@ -64,6 +66,7 @@ class UsbPort:
         self._address = address
         self._arrived: deque[bytes] = deque()
         self._arrived_bytes = 0
+        self._awaited_bytes = 1  # the reader of the port is woken by no less
         self._changed = threading.Condition()
         self._is_cancelled = False
         self._is_closed = False
@@ -87,7 +90,10 @@ class UsbPort:
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read."""
         with self._changed:
-            self._changed.wait_for(self._has_news, max(timeout_s, 0.0))
+            if not self._arrived:
+                self._await(1, max(timeout_s, 0.0))
+                if self._arrived_bytes >= _GATHER_FROM_BYTES:
+                    self._await(READ_BYTES, _GATHER_S)
             self._is_cancelled, was_cancelled = False, self._is_cancelled
             if not self._arrived and not was_cancelled:
                 self._check()
@@ -171,7 +177,8 @@ class UsbPort:
         with self._changed:
             self._arrived.append(data)
             self._arrived_bytes += len(data)
-            self._changed.notify_all()
+            if self._arrived_bytes >= self._awaited_bytes:
+                self._changed.notify_all()
 
     def _lose(self, why: str) -> None:
         with self._changed:
@@ -180,16 +187,24 @@ class UsbPort:
 
     # -- the reader of the port ----------------------------------------------------------------------------------
 
+    def _await(self, size_bytes: int, timeout_s: float) -> None:
+        """Wait until so much has arrived, or something else happens."""
+        self._awaited_bytes = size_bytes
+        self._changed.wait_for(self._has_news, timeout_s)
+
     def _has_news(self) -> bool:
-        return bool(self._arrived or self._is_cancelled or self._lost or self._is_closed)
+        has_enough = self._arrived_bytes >= self._awaited_bytes
+        return bool(has_enough or self._is_cancelled or self._lost or self._is_closed)
 
     def _take(self, max_bytes: int) -> bytes:
+        was_full = self._arrived_bytes >= _WAITING_BYTES_MAX
         data = self._arrived.popleft()
         if len(data) > max_bytes:
             self._arrived.appendleft(data[max_bytes:])
             data = data[:max_bytes]
         self._arrived_bytes -= len(data)
-        self._changed.notify_all()
+        if was_full:
+            self._changed.notify_all()
         return data
 
     def _check(self) -> None:

@@ -24,6 +24,7 @@ from node.repair import Repaired, repair
 from node.scan_quality import ScanQuality, coverage_of, slip_matters, survey
 from protocol.errors import FoveascanError, RemoteWireError
 from protocol.grid import VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArray, IntArray, StepArray
+from protocol.scanner_messages import Payload
 
 COUNTS_MAX = 1 << 31
 COUNTS_PER_COLUMN_MIN = 2
@@ -115,6 +116,14 @@ class Assembler:
         brings more columns than any sweep has.
         """
         self._range.add(self._encoder.tick(encoder_count), row0, samples)
+
+    def add_range_bytes(self, encoder_count: int, row0: int, data: Payload) -> None:
+        """As add_range_column, samples as they travel: little-endian uint16."""
+        self._range.add_bytes(self._encoder.tick(encoder_count), row0, data)
+
+    def add_texture_bytes(self, encoder_count: int, row0: int, data: Payload) -> None:
+        """As add_texture_column, samples as they travel: R, G and B, a byte each."""
+        self._texture.add_bytes(self._encoder.tick(encoder_count), row0, data)
 
     def add_texture_column(self, encoder_count: int, row0: int, samples: ImageArray) -> None:
         """Take rows row0... of the texture column at an encoder count, as for range. samples : (n, 3) uint8 RGB."""
@@ -284,28 +293,29 @@ class _Columns(Generic[Samples]):
         self._tolerance = tolerance
         self._blend: Callable[[Samples, Samples, WeightArray], Samples] = blend
         self._slot_of: dict[int, int] = {}
-        self._whole = (1 << slots.shape[1]) - 1
+        self._height = slots.shape[1]
+        self._column_bytes, self._row_bytes = slots.strides[:2]
+        self._whole = (1 << self._height) - 1
         self._rows = [0] * slots.shape[0]  # per slot, a bit for each row that has come
 
     def add(self, tick: int, row0: int, samples: Samples) -> None:
-        height = self._slots.shape[1]
         if samples.dtype != self._slots.dtype or samples.shape[1:] != self._slots.shape[2:]:
             wanted = "(n, 3) uint8" if self._slots.ndim == 3 else "(n,) uint16"
             raise ValueError(f"{self._channel} samples must be {wanted}, got {samples.shape} {samples.dtype}")
-        if not (0 <= row0 and row0 + samples.shape[0] <= height):
-            raise RemoteWireError(f"{self._channel} rows {row0}+{samples.shape[0]} do not fit a column of {height}")
+        self.add_bytes(tick, row0, np.ascontiguousarray(samples).data.cast("B"))
+
+    def add_bytes(self, tick: int, row0: int, data: Payload) -> None:
+        """Numpy would let other threads in, and wait for them (protocol.checksum); so bytes are copied as such."""
+        rows = len(data) // self._row_bytes
+        if row0 < 0 or row0 + rows > self._height:
+            raise RemoteWireError(f"{self._channel} rows {row0}+{rows} do not fit a column of {self._height}")
         slot = self._slot_of.get(tick, len(self._slot_of))
-        if slot == len(self._slots):
+        if slot == len(self._rows):
             self._grow()
         self._slot_of[tick] = slot
-        self._copy(slot, row0, samples)
-        self._rows[slot] |= ((1 << samples.shape[0]) - 1) << row0
-
-    def _copy(self, slot: int, row0: int, samples: Samples) -> None:
-        """Put samples into their slot; numpy would let other threads in, and wait for them (protocol.checksum)."""
-        data = np.ascontiguousarray(samples).data.cast("B")
-        begin = slot * self._slots.strides[0] + row0 * self._slots.strides[1]
+        begin = slot * self._column_bytes + row0 * self._row_bytes
         self._bytes[begin : begin + len(data)] = data
+        self._rows[slot] |= self._whole if rows == self._height else ((1 << rows) - 1) << row0
 
     def _grow(self) -> None:
         """Make room for twice as many columns."""

@@ -10,6 +10,8 @@ from pathlib import Path
 
 SYNC_S = 0.25  # what was written is made durable at least that often
 WAITING_BYTES_MAX = 8 << 20
+GATHER_S = 0.02  # what comes within this time is written at once: fewer wake-ups
+GATHER_BYTES = 1 << 20  # but no more than this
 
 
 class BackgroundWriter:
@@ -38,7 +40,8 @@ class BackgroundWriter:
             self._raise_failure()
             self._waiting.append(piece)
             self._waiting_bytes += len(piece)
-            self._changed.notify_all()
+            if len(self._waiting) == 1 or self._waiting_bytes >= GATHER_BYTES:
+                self._changed.notify_all()
 
     def close(self) -> None:
         """Make everything durable and let go of the file. Raises OSError once it is let go of."""
@@ -69,7 +72,8 @@ class BackgroundWriter:
         """Everything that waits; [] when it is only time to sync; None at the end."""
         with self._changed:
             due_s = max(0.0, self._synced_s + SYNC_S - time.monotonic()) if self._unsafe else None
-            self._changed.wait_for(lambda: self._waiting or self._closing, due_s)
+            if self._changed.wait_for(lambda: self._waiting or self._closing, due_s):
+                self._changed.wait_for(lambda: self._waiting_bytes >= GATHER_BYTES or self._closing, GATHER_S)
             if self._closing and not self._waiting and not self._unsafe:
                 return None
             batch = list(self._waiting)

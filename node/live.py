@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -147,17 +148,18 @@ class _Picture:
             Channel.RANGE: _Track(encoder, s.width, s.height, thinned_range),
             Channel.TEXTURE: _Track(encoder, s.texture_width, s.texture_height, thinned_texture),
         }
+        self._track_of = {RangeColumn: self._tracks[Channel.RANGE], TextureColumn: self._tracks[Channel.TEXTURE]}
         self.started = m.LiveStarted(sweep, _grid(s, cells, texels))
         self._progress = m.LiveProgress(sweep, 0.0)
         self.ended: m.LiveEnded | None = None
 
     def cell_of(self, column: Column) -> int | None:
         """The cell that a column shows, or None where the picture has no use for it."""
-        return self._track_of(column).cell_of(column)
+        return self._track_of[type(column)].cell_of(column)
 
     def take(self, cell: int, column: Column) -> None:
         """Show a column, or a piece of one."""
-        self._track_of(column).take(cell, column)
+        self._track_of[type(column)].take(cell, column)
 
     def progress(self, share: float, now_s: float) -> None:
         """So much of the sweep is in. How fast the rest comes is judged since then: some may have been kept before."""
@@ -181,9 +183,6 @@ class _Picture:
             said.append(self.ended)
         return said
 
-    def _track_of(self, column: Column) -> _Track:
-        return self._tracks[Channel.RANGE if isinstance(column, RangeColumn) else Channel.TEXTURE]
-
 
 class _Track:
     """One channel of a picture. thinned : (columns, rows) or (columns, rows, 3), as it travels."""
@@ -194,6 +193,7 @@ class _Track:
         self._thinned = thinned
         self._cells, rows = thinned.shape[:2]
         self._rows = (2 * np.arange(rows) + 1) * height // (2 * rows)
+        self._sorted: list[int] = self._rows.tolist()  # a list is searched in no time, and several thousand times
         self._shown: dict[int, tuple[int, int]] = {}
         self._change = np.zeros(self._cells, np.int64)
         self._changes = 0
@@ -209,7 +209,7 @@ class _Track:
         return cell if self._shown.get(cell, name) == name else None
 
     def take(self, cell: int, column: Column) -> None:
-        first, last = np.searchsorted(self._rows, (column.row0, column.row0 + column.rows))
+        first, last = (bisect_left(self._sorted, row) for row in (column.row0, column.row0 + column.rows))
         self._shown[cell] = (column.pass_index, column.column)
         self._thinned[cell, first:last] = column.samples[self._rows[first:last] - column.row0]
         self._changes += 1

@@ -103,9 +103,9 @@ def encoder_of(header: SweepHeader) -> Encoder:
 def add_column(assembler: Assembler, column: Column) -> None:
     """Hand a column of the link to an assembler. Raises RemoteWireError when it does not fit."""
     if isinstance(column, RangeColumn):
-        assembler.add_range_column(column.encoder, column.row0, column.samples)
+        assembler.add_range_bytes(column.encoder, column.row0, column.data)
     else:
-        assembler.add_texture_column(column.encoder, column.row0, column.samples)
+        assembler.add_texture_bytes(column.encoder, column.row0, column.data)
 
 
 def _swept_again(

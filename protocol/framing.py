@@ -29,6 +29,7 @@ DROPPED_MAX = 65536  # a longer run of unreadable bytes is reported in pieces of
 _HEADER = struct.Struct("<2sBBBBHIHH")
 _HEADER_CHECKED = _HEADER.size - 2
 _TRAILER = struct.Struct("<I")
+_HEADER_BYTES, _TRAILER_BYTES = _HEADER.size, _TRAILER.size
 _CRC16_START = 0xFFFF
 FRAME_OVERHEAD = _HEADER.size + _TRAILER.size
 
@@ -108,7 +109,7 @@ class FrameReader:
 
     def receive_data(self, data: bytes) -> None:
         """Take the next bytes of the line, in any portions."""
-        self._data = self._data[self._at :] + data
+        self._data = self._data[self._at :] + data if self._at < len(self._data) else data
         self._view = memoryview(self._data)
         self._at = 0
 
@@ -116,14 +117,14 @@ class FrameReader:
         """The next frame or dropped run, or None until more data is received."""
         while True:
             found = self._frame_here()
+            if found is None:
+                return None
             if isinstance(found, Frame):
                 if self._dropped_bytes:
                     return self._report(self._dropped_bytes)
                 self._dropped_reason = None
-                self._at += found.size_bytes
+                self._at += FRAME_OVERHEAD + len(found.payload)
                 return found
-            if found is None:
-                return None
             self._skip(found)
             if self._dropped_bytes >= DROPPED_MAX:
                 return self._report(DROPPED_MAX)
@@ -140,22 +141,23 @@ class FrameReader:
 
     def _frame_here(self) -> Frame | DropReason | None:
         """The frame at the reading position, or what is wrong with it, or None while it is too short to tell."""
-        at = self._at
-        if len(self._data) - at < _HEADER.size:
+        at, data, view = self._at, self._data, self._view
+        start = at + _HEADER_BYTES
+        if len(data) < start:
             return None
-        magic, version, type_, flags, _, session, seq, length, check = _HEADER.unpack_from(self._data, at)
+        magic, version, type_, flags, _, session, seq, length, check = _HEADER.unpack_from(data, at)
         if magic != MAGIC:
             return DropReason.NOISE
-        if check != binascii.crc_hqx(self._view[at : at + _HEADER_CHECKED], _CRC16_START):
+        if check != binascii.crc_hqx(view[at : at + _HEADER_CHECKED], _CRC16_START):
             return DropReason.HEADER
         if length > self._payload_max:
             return DropReason.LENGTH
-        start, end = at + _HEADER.size, at + _HEADER.size + length
-        if len(self._data) < end + _TRAILER.size:
+        end = start + length
+        if len(data) < end + _TRAILER_BYTES:
             return None
-        if crc32(self._view[at:end]) != _TRAILER.unpack_from(self._data, end)[0]:
+        if crc32(view[at:end]) != _TRAILER.unpack_from(data, end)[0]:
             return DropReason.PAYLOAD
-        return Frame(type_, self._view[start:end], seq, session, flags, version)
+        return Frame(type_, view[start:end], seq, session, flags, version)
 
     def _skip(self, reason: DropReason) -> None:
         """Go to the next magic, or keep a last byte that may be its first half."""

@@ -47,7 +47,11 @@ class RangeColumn:
     @property
     def checksum(self) -> int:
         """CRC-32 of its payload, as SWEEP_END adds it up."""
-        return crc32(self.data, crc32(_column_name(self)))
+        return crc32(self.data, crc32(self.name_bytes()))
+
+    def name_bytes(self) -> bytes:
+        """What stands before the samples in the table RANGE_COLUMN."""
+        return _column_name(self)
 
     def to_bytes(self) -> bytes:
         """As the table RANGE_COLUMN."""
@@ -87,7 +91,11 @@ class TextureColumn:
     @property
     def checksum(self) -> int:
         """CRC-32 of its payload, as SWEEP_END adds it up."""
-        return crc32(self.data, crc32(_column_name(self)))
+        return crc32(self.data, crc32(self.name_bytes()))
+
+    def name_bytes(self) -> bytes:
+        """What stands before the samples in the table TEXTURE_COLUMN."""
+        return _column_name(self)
 
     def to_bytes(self) -> bytes:
         """As the table TEXTURE_COLUMN."""
@@ -159,9 +167,11 @@ def _column_name(column: Column) -> bytes:
 
 
 def _column_fields(payload: Payload, sample_bytes: int) -> tuple[int, int, int, int, int, int, Payload]:
-    time_us, encoder, sweep, column, row0, pass_index = unpack(_COLUMN, payload)
-    data = payload[_COLUMN.size :]
-    check(len(data) > 0 and len(data) % sample_bytes == 0, f"{len(data)} bytes are no whole samples")
+    size = len(payload) - COLUMN_OVERHEAD
+    if size <= 0 or size % sample_bytes:
+        raise ValueError(f"{size} bytes are no whole samples")
+    time_us, encoder, sweep, column, row0, pass_index = _COLUMN.unpack_from(payload)
+    data = payload[COLUMN_OVERHEAD:]
     return sweep, pass_index, column, row0, encoder, time_us, data
 
 

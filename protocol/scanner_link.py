@@ -262,8 +262,7 @@ class ScannerLink:
     def _take_frame(self, frame: Frame) -> Event | None:
         if frame.version != MAJOR:
             return self._meet_stranger(frame)
-        is_hello = self.role is Role.DEVICE and frame.type == Hello.TYPE
-        if frame.session != self._session and not is_hello:
+        if frame.session != self._session and not (self.role is Role.DEVICE and frame.type == Hello.TYPE):
             return Dropped(DropReason.SESSION, frame.size_bytes)
         if not is_known(frame.type):
             return self._reject(frame, DropReason.UNKNOWN, NakCode.UNKNOWN, f"no message type {frame.type:#04x}")
@@ -272,6 +271,9 @@ class ScannerLink:
         except RemoteWireError as error:
             return self._reject(frame, DropReason.MALFORMED, NakCode.MALFORMED, str(error)[:150])
         self.frames_heard += 1
+        if isinstance(message, _COLUMNS) and self.role is Role.HOST:  # thousands a second
+            self._count_column(FRAME_OVERHEAD + len(frame.payload))
+            return message
         return self._take_message(frame, message)
 
     def _take_message(self, frame: Frame, message: Message) -> Event | None:
@@ -284,9 +286,6 @@ class ScannerLink:
         return self._take_from_host(frame, message)
 
     def _take_from_device(self, frame: Frame, message: Message) -> Event | None:
-        if isinstance(message, _COLUMNS):
-            self._count_column(frame.size_bytes)
-            return message
         if isinstance(message, Status):
             self._correct_count(message)
             return message
