@@ -91,7 +91,7 @@ async def _look(args: argparse.Namespace) -> None:
             shape = [s.height, s.width], [s.texture_height, s.texture_width]
             first_view_bytes = session.stats.bytes_received
             record = {"scan": s.id, "range": shape[0], "texture": shape[1], "first_view_bytes": first_view_bytes}
-            _print(args, record, f"scan {s.id}: {s.width} x {s.height}, first view {first_view_bytes} bytes")
+            _print(args, record, f"scan {printable(s.id)}: {s.width} x {s.height}, first view {first_view_bytes} bytes")
             for u, v in clicks:
                 update = await _look_at(session, args, u, v)
                 bar.update()

@@ -55,13 +55,13 @@ def read_credentials() -> tuple[Credential, ...]:
 
 
 def keep_credential(credential: Credential) -> None:
-    """Keep one, in place of an older one of that node. Raises AccessError."""
+    """Keep one, in place of an older one of that node; of too many the oldest goes. Raises AccessError."""
     path = credentials_path()
-    others = tuple(other for other in read_credentials() if other.node != credential.node)
+    others = [other for other in read_credentials() if other.node != credential.node]
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with whole_file(path, private=True) as file:
-            file.write(msgspec.json.encode(_File((*others, credential))))
+            file.write(msgspec.json.encode(_File((*others[1 - CREDENTIALS_MAX :], credential))))
     except OSError as error:
         raise AccessError(f"{path}: {error.strerror}") from error
 

@@ -7,8 +7,7 @@ import msgspec
 
 from client.discovery import NodeAddress
 from client.login import logged_in
-from client.rest import ask
-from protocol.errors import RemoteWireError
+from client.rest import ask, checked
 from protocol.grid import Geometry
 
 TIMEOUT = aiohttp.ClientTimeout(total=600)
@@ -46,7 +45,4 @@ async def derive_scan(
     }  # fmt: skip
     async with logged_in(node, token) as (url, http):
         said = await ask(http, "POST", f"{url}/v1/scans/{scan}/derive", wanted, TIMEOUT)
-    try:
-        return msgspec.convert(said, Derived)
-    except msgspec.ValidationError as problem:
-        raise RemoteWireError(f"the node made a scan and does not say which: {problem}") from None
+    return checked(said, Derived, "the node made a scan and does not say which")

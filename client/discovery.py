@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
+from yarl import URL
 from zeroconf import IPVersion, ServiceStateChange, Zeroconf
 from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo, AsyncZeroconf
 
@@ -34,6 +35,21 @@ class NodeAddress:
         """Its address as `connect` takes it."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.tls else 'http'}://{host}:{self.port}"
+
+
+def located(node: NodeAddress | str) -> tuple[str, URL]:
+    """A node's URL as it is kept and shown, and its parts; given by what `discover` found or by its URL.
+
+    Raises NodeLost for what is no URL of a node.
+    """
+    url = node.url if isinstance(node, NodeAddress) else node.rstrip("/")
+    try:
+        parts = URL(url)
+        if parts.scheme in ("http", "https") and parts.host:
+            return url, parts
+    except ValueError:
+        pass
+    raise NodeLost(f"{url!r} is no address of a node; use https://HOST:PORT")
 
 
 async def discover(timeout_s: float = 3, name: str | None = None, *, settle_s: float = SETTLE_S) -> list[NodeAddress]:

@@ -6,11 +6,10 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import aiohttp
-from yarl import URL
 
 from client.credentials import find_credential
-from client.discovery import NodeAddress
-from client.errors import NodeLost, NodeNotTrusted
+from client.discovery import NodeAddress, located
+from client.errors import NodeNotTrusted
 from client.trust import KeyPin, certificate_pin
 
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
@@ -28,29 +27,18 @@ async def logged_in(
 
     token, fingerprint : None: what pairing has kept. Raises NodeLost, NodeNotTrusted, AccessError, LocalWireError.
     """
-    url, scheme, host = _parts(node)
-    known = find_credential(url, node.id if isinstance(node, NodeAddress) else None) if scheme == "https" else None
+    url, parts = located(node)
+    is_tls = parts.scheme == "https"
+    known = find_credential(url, node.id if isinstance(node, NodeAddress) else None) if is_tls else None
     trust: aiohttp.Fingerprint | bool = True
     if fingerprint is not None:
         trust = certificate_pin(fingerprint)
     elif known is not None and known.key:
         trust = KeyPin(bytes.fromhex(known.key))
     token = token or (known.token if known else None)
-    if token and scheme == "http" and host not in LOOPBACK:
+    if token and not is_tls and parts.host not in LOOPBACK:
         raise NodeNotTrusted(f"a token is not sent in the clear: use https://, not {url}")
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     connector = aiohttp.TCPConnector(ssl=trust)
     async with aiohttp.ClientSession(connector=connector, headers=headers, timeout=timeout) as http:
         yield url, http
-
-
-def _parts(node: NodeAddress | str) -> tuple[str, str, str]:
-    """Its URL, the scheme and the host. Raises NodeLost."""
-    url = node.url if isinstance(node, NodeAddress) else node.rstrip("/")
-    try:
-        parsed = URL(url)
-        if parsed.scheme in ("http", "https") and parsed.host:
-            return url, parsed.scheme, parsed.host
-    except ValueError:
-        pass
-    raise NodeLost(f"{url!r} is no address of a node; use https://HOST:PORT")

@@ -6,16 +6,13 @@ import hmac
 import secrets
 
 import aiohttp
-import msgspec
-from yarl import URL
 
 from client.credentials import Credential, keep_credential
-from client.discovery import NodeAddress
+from client.discovery import NodeAddress, located
 from client.errors import NodeLost, NodeNotTrusted
-from client.rest import ask
+from client.rest import ask, checked
 from client.trust import certificate_pin, key_hash, look_at_certificate
 from protocol import pairing
-from protocol.errors import RemoteWireError
 
 NONCE_BYTES = 16
 
@@ -27,9 +24,10 @@ async def pair(node: NodeAddress | str, code: str) -> Credential:
     Raises LocalWireError for what is no code, RequestRefused, NodeLost, NodeNotTrusted, RemoteWireError, AccessError.
     """
     key = pairing.key_of(pairing.parse_code(code))
-    url = node.url if isinstance(node, NodeAddress) else node.rstrip("/")
-    host, port = _place(url)
-    certificate, is_vouched = await look_at_certificate(host, port)
+    url, parts = located(node)
+    if parts.scheme != "https" or not parts.host or not parts.port:
+        raise NodeLost(f"{url!r} cannot be paired with: use https://HOST:PORT; a node with --insecure needs no login")
+    certificate, is_vouched = await look_at_certificate(parts.host, parts.port)
     seen, nonce = pairing.fingerprint(certificate), secrets.token_hex(NONCE_BYTES)
     request = pairing.PairRequest(nonce, pairing.client_proof(key, seen, nonce))
     connector = aiohttp.TCPConnector(ssl=certificate_pin(seen))
@@ -43,23 +41,9 @@ async def pair(node: NodeAddress | str, code: str) -> Credential:
     return credential
 
 
-def _place(url: str) -> tuple[str, int]:
-    """Host and port. Raises NodeLost."""
-    try:
-        parsed = URL(url)
-        if parsed.scheme == "https" and parsed.host and parsed.port:
-            return parsed.host, parsed.port
-    except ValueError:
-        pass
-    raise NodeLost(f"{url!r} cannot be paired with: use https://HOST:PORT of a node; with --insecure it needs no login")
-
-
 def _checked(said: object, key: bytes, seen: str, nonce: str) -> pairing.Paired:
     """The answer, if it comes from whoever made the code. Raises RemoteWireError, NodeNotTrusted."""
-    try:
-        paired = msgspec.convert(said, pairing.Paired)
-    except msgspec.ValidationError as error:
-        raise RemoteWireError(f"a bad answer to pairing: {error}") from None
+    paired = checked(said, pairing.Paired, "a bad answer to pairing")
     if not hmac.compare_digest(paired.proof, pairing.node_proof(key, seen, nonce, paired.token, paired.role)):
         raise NodeNotTrusted("whoever answered does not know the code: it is not the node that printed it")
     return paired

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import aiohttp
 import msgspec
@@ -13,6 +13,8 @@ from protocol.errors import RemoteWireError
 
 BODY_MAX_BYTES = 4 << 20
 TIMEOUT = aiohttp.ClientTimeout(total=30)
+
+Record = TypeVar("Record")
 
 
 async def ask(
@@ -30,14 +32,21 @@ async def ask(
         raise trouble(url, error) from error
 
 
-async def bounded_body(response: aiohttp.ClientResponse) -> bytes:
+async def bounded_body(response: aiohttp.ClientResponse, limit_bytes: int = BODY_MAX_BYTES) -> bytes:
     """All a node sends, of a bounded length. Raises RemoteWireError when it goes on beyond that."""
     body = bytearray()
     async for chunk in response.content.iter_any():
         body += chunk
-        if len(body) > BODY_MAX_BYTES:
-            raise RemoteWireError(f"{response.url} sends more than {BODY_MAX_BYTES} bytes")
+        if len(body) > limit_bytes:
+            raise RemoteWireError(f"{response.url} sends more than {limit_bytes} bytes")
     return bytes(body)
+
+
+async def check_granted(response: aiohttp.ClientResponse) -> None:
+    """Raises RequestRefused with the node's reason unless it grants what was asked for, RemoteWireError without one."""
+    if response.status != 200:
+        reply(response.status, await bounded_body(response))
+        raise RemoteWireError(f"{response.url} answers with HTTP {response.status}, without what was asked for")
 
 
 def reply(status: int, body: bytes) -> Any:
@@ -50,3 +59,11 @@ def reply(status: int, body: bytes) -> Any:
         error = said if isinstance(said, dict) else {}
         raise RequestRefused(str(error.get("code", f"HTTP {status}")), str(error.get("message", "")))
     return said
+
+
+def checked(said: object, kind: type[Record], what: str) -> Record:
+    """What a node said, as a record of a kind. what : it is, for the message. Raises RemoteWireError for another."""
+    try:
+        return msgspec.convert(said, kind)
+    except msgspec.ValidationError as problem:
+        raise RemoteWireError(f"{what}: {problem}") from None

@@ -35,7 +35,7 @@ def run_scan(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"scan": scan, "quality": asdict(quality) if quality else None}), flush=True)
         return 0
-    print(f"scan {scan}", flush=True)
+    print(f"scan {printable(scan)}", flush=True)
     for line in _in_words(quality) if quality else ():
         print(line, flush=True)
     return 0

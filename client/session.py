@@ -26,7 +26,7 @@ from client.login import logged_in
 from client.model import Model
 from client.news import News
 from client.reader import Reader, Stats
-from client.rest import ask
+from client.rest import ask, checked
 from client.stream import Stream, open_stream
 from client.update import Update
 from protocol import messages as m
@@ -67,6 +67,21 @@ class _Assessed(msgspec.Struct):
     """What is read of GET /v1/scans/{id}; a node of an earlier version says no quality."""
 
     quality: m.ScanQuality | None = None
+
+
+class _Scanner(msgspec.Struct):
+    """What is read of a scanner's status; a node of a later version may say more."""
+
+    phase: str
+    progress: float
+    sweeps: int
+    why: str
+
+
+class _Node(msgspec.Struct):
+    """What is read of GET /v1/node."""
+
+    capture: _Scanner
 
 
 class Session:
@@ -235,23 +250,25 @@ class Session:
 
     async def scans(self) -> list[dict[str, Any]]:
         """The scans in the node's library, newest first, as GET /v1/scans describes them."""
-        return list(await ask(self._http, "GET", f"{self._stream.url}/v1/scans"))
+        said = await ask(self._http, "GET", f"{self._stream.url}/v1/scans")
+        return checked(said, list[dict[str, Any]], f"{self._stream.url} lists its scans")
 
     async def quality(self, scan: str) -> m.ScanQuality | None:
         """What a scan is worth; None of one that came as a file. scan : an id or "latest"."""
         said = await ask(self._http, "GET", f"{self._stream.url}/v1/scans/{scan}")
-        try:
-            return msgspec.convert(said, _Assessed).quality
-        except msgspec.ValidationError as problem:
-            raise RemoteWireError(f"{self._stream.url} describes the quality of scan {scan}: {problem}") from None
+        return checked(said, _Assessed, f"{self._stream.url} describes the quality of scan {scan}").quality
 
     async def scanner(self) -> dict[str, Any]:
         """What the node's scanner is doing, as GET /v1/node says under "capture": phase, progress, sweeps, why."""
-        return dict((await ask(self._http, "GET", f"{self._stream.url}/v1/node"))["capture"])
+        said = await ask(self._http, "GET", f"{self._stream.url}/v1/node")
+        checked(said, _Node, f"{self._stream.url} describes its scanner")
+        return dict(said["capture"])
 
     async def start_sweep(self) -> dict[str, Any]:
         """Start a sweep. Returns at once with what POST /v1/sweeps says; the scan is announced by `published`."""
-        return dict(await ask(self._http, "POST", f"{self._stream.url}/v1/sweeps"))
+        said = await ask(self._http, "POST", f"{self._stream.url}/v1/sweeps")
+        checked(said, _Scanner, f"{self._stream.url} starts a sweep")
+        return dict(said)
 
     async def close(self) -> None:
         """End the session; whoever still waits gets NodeLost. `connect` does this at the end of its block."""

@@ -11,11 +11,10 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import aiohttp
-import msgspec
 
-from client.errors import RequestRefused
 from client.login import logged_in
 from client.model import Model
+from client.rest import ask, bounded_body, check_granted, checked
 from client.trust import trouble
 from protocol.errors import RemoteWireError
 from protocol.messages import ScanInfo
@@ -38,6 +37,7 @@ class SharedViewer:
         """Refine round (u, v). Returns the bytes received.
 
         asked : window, texture_db, range_mm, max_bytes, alpha, scale, codec, as for Session.look.
+        Raises what `open_shared` raises.
         """
         place = f"{self._url}/v1/scans/{self.model.info.id}/fovea"
         body = await self._body(place, {"u": u, "v": v, **asked})
@@ -48,13 +48,11 @@ class SharedViewer:
     async def _body(self, url: str, query: dict[str, Any]) -> bytes:
         try:
             async with self._http.get(url, params=query) as response:
-                body = await response.content.read(BODY_MAX_BYTES + 1)
-                if response.status != 200:
-                    raise RequestRefused(f"HTTP {response.status}", body[:500].decode(errors="replace"))
+                await check_granted(response)
                 self.hits += response.headers.get("X-Cache-Status") == "HIT"
+                return await bounded_body(response, BODY_MAX_BYTES)
         except (aiohttp.ClientError, OSError) as error:
             raise trouble(self._url, error) from error
-        return body
 
 
 @asynccontextmanager
@@ -74,17 +72,8 @@ async def open_shared(
 
 
 async def _described(http: aiohttp.ClientSession, url: str, scan: str) -> Model:
-    try:
-        async with http.get(f"{url}/v1/scans/{scan}") as response:
-            body = await response.content.read(BODY_MAX_BYTES)
-            if response.status != 200:
-                raise RequestRefused(f"HTTP {response.status}", body[:500].decode(errors="replace"))
-    except (aiohttp.ClientError, OSError) as error:
-        raise trouble(url, error) from error
-    try:
-        return Model(msgspec.json.decode(body, type=ScanInfo))
-    except (msgspec.DecodeError, UnicodeError) as error:
-        raise RemoteWireError(f"bad description of scan {scan}: {error}") from None
+    said = await ask(http, "GET", f"{url}/v1/scans/{scan}")
+    return Model(checked(said, ScanInfo, f"{url} describes scan {scan}"))
 
 
 def refinements_in(body: bytes) -> list[Refinement]:

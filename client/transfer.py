@@ -9,9 +9,9 @@ from typing import BinaryIO, NamedTuple
 
 import aiohttp
 
-from client.discovery import NodeAddress
+from client.discovery import NodeAddress, located
 from client.login import logged_in
-from client.rest import bounded_body, reply
+from client.rest import bounded_body, check_granted, reply
 from client.trust import trouble
 from exchange.formats import suffix_of
 from exchange.whole_file import whole_file
@@ -34,9 +34,7 @@ async def fetch_scan(
     before.
     """
     async with _request("GET", node, f"/v1/scans/{scan}{suffix_of(path)}", token) as response:
-        if response.status != 200:
-            reply(response.status, await bounded_body(response))
-            raise RemoteWireError(f"HTTP {response.status} without a file")
+        await check_granted(response)
         with whole_file(path) as file:
             async for chunk in response.content.iter_chunked(CHUNK_BYTES):
                 file.write(chunk)
@@ -88,4 +86,4 @@ async def _request(
         ):
             yield response
     except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
-        raise trouble(node.url if isinstance(node, NodeAddress) else node, error) from error
+        raise trouble(located(node)[0], error) from error

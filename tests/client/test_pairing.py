@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from client import NodeAddress, NodeLost, NodeNotTrusted, RequestRefused, connect, pair
+from client import NodeAddress, NodeLost, NodeNotTrusted, RequestRefused, connect, credentials, pair
 from client.credentials import Credential, credentials_path, find_credential, keep_credential, read_credentials
 from client.login import logged_in
 from client.transfer import fetch_scan
@@ -200,6 +200,13 @@ def test_the_latest_of_a_node_counts() -> None:
     assert find_credential("https://anywhere", "1") == credential("1", "https://c:1")
     assert find_credential("https://b:1") == credential("2", "https://b:1")
     assert find_credential("https://a:1") is None and find_credential("https://b:1", "3") is None
+
+
+def test_of_too_many_the_oldest_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(credentials, "CREDENTIALS_MAX", 2)
+    for node in "123":
+        keep_credential(credential(node))
+    assert [one.node for one in read_credentials()] == ["2", "3"]
 
 
 def test_a_damaged_file_is_named() -> None:

@@ -245,16 +245,32 @@ async def test_scans_and_sweeps_are_asked_for_over_http() -> None:
         return web.json_response([{"id": "b"}, {"id": "a"}])
 
     async def sweep(request: web.Request) -> web.Response:
-        return web.json_response({"phase": "sweeping", "progress": 0.0}, status=202)
+        return web.json_response({"phase": "sweeping", "progress": 0.0, "sweeps": 0, "why": ""}, status=202)
 
     async def node(request: web.Request) -> web.Response:
-        return web.json_response({"id": "0123", "capture": {"phase": "sweeping", "progress": 0.5}})
+        capture = {"phase": "sweeping", "progress": 0.5, "sweeps": 0, "why": ""}
+        return web.json_response({"id": "0123", "capture": capture})
 
     routes = web.get("/v1/scans", scans), web.post("/v1/sweeps", sweep), web.get("/v1/node", node)
     async with session_with(show_and_answer, *routes) as session:
         assert [scan["id"] for scan in await session.scans()] == ["b", "a"]
         assert (await session.start_sweep())["phase"] == "sweeping"
         assert (await session.scanner())["progress"] == 0.5
+
+
+@pytest.mark.parametrize("said", [[], 1, {}, {"phase": "ready"}, {"capture": []}, {"capture": {"phase": 1}}, [{}, 1]])
+async def test_an_answer_of_another_kind_is_one_of_our_errors(said: object) -> None:
+    async def answer(request: web.Request) -> web.Response:
+        return web.json_response(said)
+
+    routes = web.get("/v1/scans", answer), web.post("/v1/sweeps", answer), web.get("/v1/node", answer)
+    async with session_with(show_and_answer, *routes) as session:
+        for asking in (session.scanner, session.start_sweep):
+            with pytest.raises(RemoteWireError, match="scanner|sweep"):
+                await asking()
+        if said != []:
+            with pytest.raises(RemoteWireError, match="lists its scans"):
+                await session.scans()
 
 
 @pytest.mark.parametrize(
