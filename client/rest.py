@@ -17,6 +17,19 @@ TIMEOUT = aiohttp.ClientTimeout(total=30)
 Record = TypeVar("Record")
 
 
+class ListedScan(msgspec.Struct, rename="camel"):
+    """What is read of a scan in GET /v1/scans. created : Unix time [s]; sizes as in ScanInfo."""
+
+    id: str
+    name: str
+    created: float
+    width: int
+    height: int
+    texture_width: int
+    texture_height: int
+    geometry: str = "cylinder"
+
+
 async def ask(
     http: aiohttp.ClientSession, method: str, url: str, body: object = None, timeout: aiohttp.ClientTimeout = TIMEOUT
 ) -> Any:

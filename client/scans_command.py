@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 from datetime import datetime
-from typing import Any
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from client.arguments import add_node, chosen_node
 from protocol.printable import printable
+
+if TYPE_CHECKING:
+    from client.rest import ListedScan
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -24,28 +25,15 @@ def run_scans(args: argparse.Namespace) -> int:
     """Print every scan's id, when it was made, its size and its name."""
     import asyncio
 
-    from client.rest import checked
+    from client.rest import ListedScan, checked
 
     said = asyncio.run(_scans(args))
-    scans = checked(said, list[_Listed], "the node lists its scans; update the older of the two")
+    scans = checked(said, list[ListedScan], "the node lists its scans; update the older of the two")
     for record, scan in zip(said, scans, strict=True):
         print(json.dumps(record) if args.json else _line(scan))
     if not scans and not args.json:
         print("no scans")
     return 0
-
-
-class _Listed(msgspec.Struct, rename="camel"):
-    """What is shown of a scan of the list."""
-
-    id: str
-    name: str
-    created: float
-    width: int
-    height: int
-    texture_width: int
-    texture_height: int
-    geometry: str = "cylinder"
 
 
 async def _scans(args: argparse.Namespace) -> Any:
@@ -57,7 +45,7 @@ async def _scans(args: argparse.Namespace) -> Any:
         return await ask(http, "GET", f"{url}/v1/scans")
 
 
-def _line(scan: _Listed) -> str:
+def _line(scan: ListedScan) -> str:
     shape = f"{scan.width} x {scan.height} + {scan.texture_width} x {scan.texture_height}"
     if scan.geometry != "cylinder":
         shape += f" {printable(scan.geometry)}"
