@@ -11,6 +11,7 @@ from exchange.errors import ExchangeError
 from protocol.grid import HEIGHT_MAX, WIDTH_MAX, ImageArray
 
 IMAGE_BYTES_MAX = 1 << 30
+NO_IMAGE = "is no image we read, or damaged, or far too large: save it anew as PNG or JPEG"
 PNG_LEVEL = 1  # twice as fast as the default for a few percent more bytes
 
 
@@ -31,9 +32,12 @@ def read_image(path: Path) -> ImageArray:
         raise ExchangeError(f"texture: {path} is larger than {IMAGE_BYTES_MAX} bytes")
     _check_size(path)
     data = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    except cv2.error as problem:  # a size beyond its own bound
+        raise ExchangeError(f"texture: {path} {NO_IMAGE}") from problem
     if image is None:
-        raise ExchangeError(f"texture: {path} is no image that OpenCV reads")
+        raise ExchangeError(f"texture: {path} {NO_IMAGE}")
     return np.asarray(image, np.uint8)
 
 
@@ -41,12 +45,13 @@ def _check_size(path: Path) -> None:
     """Bound what decoding would allocate. What Pillow does not know is left to OpenCV, which has a bound of its own."""
     from PIL import Image, UnidentifiedImageError
 
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-    except UnidentifiedImageError:
-        return
-    except Image.DecompressionBombError as problem:
-        raise ExchangeError(f"texture: {path}: {problem}") from problem
+    with open(path, "rb") as file:
+        try:
+            with Image.open(file) as image:
+                width, height = image.size
+        except UnidentifiedImageError:
+            return
+        except (Image.DecompressionBombError, OSError, ValueError) as problem:  # the last two: chunks that are damaged
+            raise ExchangeError(f"texture: {path} {NO_IMAGE}") from problem
     if width > WIDTH_MAX or height > HEIGHT_MAX:
         raise ExchangeError(f"texture: {path} has {width} x {height} texels, at most {WIDTH_MAX} x {HEIGHT_MAX}")

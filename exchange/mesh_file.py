@@ -205,7 +205,7 @@ def _check_gltf(path: Path) -> None:
         for number, accessor in enumerate(accessors):
             if not 0 <= int(accessor["count"]) <= 3 * FACES_MAX:
                 raise ExchangeError(f"{path}: accessors[{number}].count: {accessor['count']}, at most {3 * FACES_MAX}")
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, struct.error) as problem:
+    except (ValueError, OverflowError, TypeError, KeyError, AttributeError, RecursionError, struct.error) as problem:
         raise ExchangeError(f"{path}: {NO_MESH.format(path.suffix.lower())}") from problem
 
 

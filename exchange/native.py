@@ -126,12 +126,14 @@ class _Members:
 
 
 def _header(member: BinaryIO) -> tuple[Shape, bool, np.dtype[Any]]:
+    """Shape, order and type of an array; of version 1 alone, whose headers cannot say that they are gigabytes long."""
     version = np.lib.format.read_magic(member)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(member)
-    if version == (2, 0):
-        return np.lib.format.read_array_header_2_0(member)
-    raise ValueError(f"version {version} of the array format")
+    if version != (1, 0):
+        raise ValueError(f"version {version} of the array format")
+    header = np.lib.format.read_array_header_1_0(member)
+    if min(header[0], default=0) < 0:
+        raise ValueError(f"a shape of {header[0]}")
+    return header
 
 
 def _read(members: _Members, texture: ImageArray | None) -> Scanned:

@@ -1,5 +1,7 @@
 """Which file is what, images included."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -59,7 +61,23 @@ def test_png_is_lossless(tmp_path: Path) -> None:
     assert np.array_equal(read_image(tmp_path / "a.png"), image)
 
 
-@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+PNG = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 4, 8, 2, 0, 0, 0))
+NO_IMAGES = {
+    "nothing": b"",
+    "text": b"not an image",
+    "a signature": PNG[:8],
+    "cut in a header": PNG[:20],
+    "cut behind it": PNG,
+    "text that unpacks to megabytes": PNG + chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(2 << 20))),
+    "larger than OpenCV decodes": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n" + bytes(100),
+}
+
+
+@pytest.mark.parametrize("content", NO_IMAGES.values(), ids=NO_IMAGES)
 def test_an_image_that_is_none_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(ExchangeError, match=r"texture: .*a\.png is no image"):

@@ -1,6 +1,8 @@
 """Grids as .npz: bit for bit there and back, and a clear refusal of everything else."""
 
 import io
+import struct
+import tracemalloc
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -115,11 +117,35 @@ def _claiming(shape: tuple[int, ...]) -> io.BytesIO:
 
 @pytest.mark.parametrize(
     ("shape", "message"),
-    [((10**9, 10**9), "depth_u16: 2000000000000000000 bytes, at most"), ((3, 5), "24 of 30"), ((3, 3), "or more")],
-)
+    [
+        ((10**9, 10**9), "depth_u16: 2000000000000000000 bytes, at most"), ((3, 5), "24 of 30"), ((3, 3), "or more"),
+        ((-1, 4), "depth_u16: is no array"), ((-3, -4), "depth_u16: is no array"),
+    ],
+)  # fmt: skip
 def test_a_shape_is_checked_before_anything_is_allocated(shape: tuple[int, ...], message: str) -> None:
     with pytest.raises(ExchangeError, match=message):
         read_native(_claiming(shape))
+
+
+HEADER = b"{'descr': '<u2', 'fortran_order': False, 'shape': (-1, 4), }\n"
+BOMBS = {
+    "a shape below nought": b"\x93NUMPY\x01\x00" + struct.pack("<H", len(HEADER)) + HEADER,
+    "a header of gigabytes": b"\x93NUMPY\x02\x00" + struct.pack("<I", 0xFFFFFFFF),
+}
+
+
+@pytest.mark.parametrize("beginning", BOMBS.values(), ids=BOMBS)
+def test_an_array_that_unpacks_without_end_is_not_unpacked(beginning: bytes) -> None:
+    file = packed(depth_u16=None, texture=TEXTURE)
+    with zipfile.ZipFile(file, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("depth_u16.npy", beginning + bytes(32 << 20))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ExchangeError, match="depth_u16: is no array"):
+            read_native(file)
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_reader_with_less_room_says_so() -> None:
