@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import math
 import re
-import zlib
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any, Literal, NamedTuple, overload
@@ -30,8 +29,9 @@ from client.rest import ask, checked
 from client.stream import Stream, open_stream
 from client.update import Update
 from protocol import messages as m
-from protocol.errors import LatticeError, LocalWireError, RemoteWireError
+from protocol.errors import CodecError, LatticeError, LocalWireError, RemoteWireError
 from protocol.holdings import LevelArray, RankArray
+from protocol.inflate import inflate
 from protocol.lattice import Channel
 from protocol.sphere import click_of
 
@@ -316,11 +316,10 @@ def error_envelope_mm(said: m.Enveloped, model: Model) -> NDArray[np.float32]:
     """The errors of an `enveloped`. (blocks_y, blocks_x) float32 [mm]. Raises RemoteWireError where they do not fit."""
     shape = model.shapes[Channel.RANGE].blocks
     size = 2 * shape[0] * shape[1]
-    inflater = zlib.decompressobj(-15)
     try:
-        errors = inflater.decompress(said.errors, size + 1)
-    except zlib.error as error:
-        raise RemoteWireError(f"enveloped: {error}") from None
-    if len(errors) != size or not inflater.eof:
+        errors = inflate(said.errors, size, "enveloped")
+    except CodecError as error:
+        raise RemoteWireError(str(error)) from None
+    if len(errors) != size:
         raise RemoteWireError(f"enveloped: {len(errors)} bytes of errors for {shape} blocks")
     return np.frombuffer(errors, "<u2").reshape(shape).astype(np.float32) * np.float32(model.info.step_mm)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 import secrets
 from pathlib import Path
 
+from node.durable import read_bounded, write_whole
 from protocol.errors import LibraryError
 
 FILE = "node-id"
+FILE_BYTES_MAX = 64
 
 
 def node_identity(folder: Path) -> str:
@@ -17,19 +18,10 @@ def node_identity(folder: Path) -> str:
     path = folder / FILE
     try:
         if not path.exists():
-            _write_whole(path, secrets.token_hex(8).encode())
-        text = path.read_bytes()[:64].decode(errors="replace").strip()
+            write_whole(path, secrets.token_hex(8).encode())
+        text = read_bounded(path, FILE_BYTES_MAX).decode(errors="replace").strip()
     except OSError as error:
         raise LibraryError(f"{path}: {error.strerror}") from error
     if not re.fullmatch("[0-9a-f]{16}", text):
         raise LibraryError(f"{path}: is no node id; remove it to have one drawn anew")
     return text
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.rename(path)

@@ -16,7 +16,6 @@ from node.durable import give_to_owner_of, sync_folder
 
 FILES = 8
 LOCK_FILE = "lock"
-LINE_BYTES_MAX = 8192
 
 
 class Trail:

@@ -11,20 +11,20 @@ escapes", and all of it is deflated.
 
 from __future__ import annotations
 
-import zlib
-
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
 from protocol.errors import CodecError
 from protocol.grid import STEPS_MAX, BoolArray, StepArray
+from protocol.inflate import inflate
 
 QUANTUM_MAX = 65534
 _ESCAPE = 3
 _BYTE = 255
 _QUICK, _THOROUGH = 6, 12  # levels of libdeflate
 _WORD_MAX = 4 * STEPS_MAX
+_VALUE_BYTES_MAX, _PADDING_BYTES = 6, 8  # two bits, an escape of one byte, one of four more
 _RUN_MIN, _RUN_MAX = 4, 258  # equal bytes that deflate makes one code of
 _EXPERIENCE = 0.93, 1.2, 6.3, 82.0  # bits a bit of entropy, a run, a symbol used, a stream
 
@@ -56,7 +56,9 @@ def survey(range_steps: StepArray, quantum: int, care: BoolArray | None = None) 
 
 def decode(payload: bytes, shape: tuple[int, int], quantum: int) -> StepArray:
     """(h, w) uint16 steps of a payload, within 1..65535. Raises CodecError."""
-    values = _Reader(_unpack(_inflate(payload, shape[0] * shape[1]), shape[0] * shape[1]))
+    count = shape[0] * shape[1]
+    unpacked = inflate(payload, _VALUE_BYTES_MAX * count + _PADDING_BYTES, "range payload")
+    values = _Reader(_unpack(unpacked, count))
     return _clamped(_synthesise(values, shape, quantum))
 
 
@@ -201,15 +203,3 @@ def _unpack(data: bytes, count: int) -> Int32Array:
     escaped[wide_places] += words.astype(np.int32)
     unsigned[places] += escaped
     return (unsigned >> 1) ^ -(unsigned & 1)
-
-
-def _inflate(payload: bytes, count: int) -> bytes:
-    """Raw deflate, whole, and no longer than `count` values can be."""
-    inflater = zlib.decompressobj(-15)
-    try:
-        data = inflater.decompress(payload, 6 * count + 8)
-    except zlib.error as error:
-        raise CodecError(f"range payload does not inflate: {error}") from error
-    if not inflater.eof or inflater.unconsumed_tail or inflater.unused_data:
-        raise CodecError("range payload is cut short or too long")
-    return data

@@ -22,6 +22,7 @@ import numpy as np
 
 from protocol.errors import CodecError
 from protocol.grid import BoolArray, IntArray
+from protocol.inflate import inflate
 
 
 def encode(mask: BoolArray) -> bytes:
@@ -39,7 +40,9 @@ def decode(payload: bytes, shape: tuple[int, int]) -> BoolArray:
     """The (h, w) bool mask of a payload. Raises CodecError for one that is cut short or does not fit the shape."""
     if not payload:
         return np.zeros(shape, np.bool_)
-    data = _inflate(payload, 1 + _bits_bytes(shape))
+    data = inflate(payload, 1 + _bits_bytes(shape), "mask")
+    if not data:
+        raise CodecError("mask is empty")
     if data[0]:
         return _mask_from_edges(_from_varints(data), shape)
     if len(data) != 1 + _bits_bytes(shape):
@@ -103,17 +106,6 @@ def _mark(edges: BoolArray, paths: IntArray) -> None:
     if not inside or (np.diff(paths, axis=0) <= 0).any():
         raise CodecError("mask has edges outside it or out of order")
     edges[np.arange(len(edges)), paths] = True
-
-
-def _inflate(payload: bytes, limit_bytes: int) -> bytes:
-    inflate = zlib.decompressobj(-zlib.MAX_WBITS)
-    try:
-        data = inflate.decompress(payload, limit_bytes)
-    except zlib.error as error:
-        raise CodecError(f"mask does not inflate: {error}") from error
-    if not inflate.eof or inflate.unused_data or not data:
-        raise CodecError("mask is cut short, too long or empty")
-    return data
 
 
 def _bits_bytes(shape: tuple[int, ...]) -> int:

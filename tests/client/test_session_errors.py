@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imagecodecs import deflate_encode
 
 from client import RequestRefused
 from client import stream as client_stream
@@ -28,6 +29,7 @@ from tests.client.scripted_node import (
 
 GRID = synthetic_grid()
 PROTOCOL_ERROR = 1002
+DEFLATED = [deflate_encode(bytes(size), raw=True) for size in (2 * 8 * 12 - 2, 2 * 8 * 12 + 2)]
 
 
 # What the caller gets wrong
@@ -117,6 +119,21 @@ async def test_an_unknown_scan_is_refused() -> None:
 
 
 # What the node gets wrong
+
+
+@pytest.mark.parametrize("errors", [b"", b"\xff", *DEFLATED], ids=["none", "noise", "few", "many"])
+async def test_an_envelope_that_does_not_fit_the_scan_is_refused(errors: bytes) -> None:
+    async def script(line: Line) -> None:
+        await show(line, Planner(GRID))
+        asked = await line.hear()
+        assert isinstance(asked, m.Envelope)
+        await line.say(m.Enveloped(asked.request, 1, errors))
+        await until_gone(line)
+
+    async with session_with(script) as session:
+        await session.open()
+        with pytest.raises(RemoteWireError, match="enveloped"):
+            await session.error_envelope()
 
 
 async def say_text(line: Line, text: str) -> None:
