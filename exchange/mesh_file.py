@@ -21,6 +21,7 @@ from protocol.grid import HEIGHT_MAX, WIDTH_MAX, FloatArray, ImageArray
 FILE_BYTES_MAX = 1 << 30
 JSON_BYTES_MAX = 1 << 26
 FACES_MAX = 20_000_000
+UV_MAX = 1e6
 GREY = 128
 NO_MESH = "is no {} file, or damaged: open it in the program that wrote it, and export it anew"
 MM_PER_M = 1000.0
@@ -185,6 +186,8 @@ def _joined(path: Path, parts: list[Mesh]) -> Mesh:
     )
     if not np.isfinite(corners).all() or not np.isfinite(uv).all():
         raise ExchangeError(f"{path}: vertices: a coordinate is not finite")
+    if (np.abs(uv) > UV_MAX).any():
+        raise ExchangeError(f"{path}: texture coordinates: beyond {UV_MAX:g} repeats of the image")
     return Mesh(corners, np.concatenate(numbers), uv, colours, tuple(images))
 
 

@@ -11,13 +11,13 @@ import hashlib
 import json
 import os
 import shutil
-import subprocess
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from node.durable import write_whole
-from node.release import build, identity, logical, require_python, unit_files
+from node.release import build, identity, logical, require_python, run, unit_files
 from protocol.errors import InstallError
 
 PROGRAM = "opt/foveascan"
@@ -37,7 +37,6 @@ PLACES = {
 }
 LAID = "laid.json"  # in PROGRAM: what we laid out, and its hash as we did
 KEPT_RELEASES = 2
-RUN_S = 180
 
 
 @dataclass
@@ -131,7 +130,7 @@ class Installer:
         settings = self.root / PLACES["node.toml"]
         if settings.exists():
             command = [str(release / "bin" / "foveascan"), "serve", "--check", "--config", str(settings)]
-            checked = subprocess.run(command, capture_output=True, text=True, timeout=RUN_S)
+            checked = run(command)
             if checked.returncode:
                 said = checked.stderr.strip().removeprefix("foveascan: ")
                 raise InstallError(f"nothing was changed: this version does not accept the settings: {said}")
@@ -197,7 +196,8 @@ class Installer:
             self._switch(before)
         if self._starts:
             for command in (["daemon-reload"], ["restart", SERVICE] if before else ["reset-failed", SERVICE]):
-                subprocess.run(["systemctl", *command], capture_output=True, timeout=RUN_S)
+                with suppress(InstallError):  # why it came to this matters more
+                    run(["systemctl", *command])
 
     def _prune(self, *kept: Path | None) -> None:
         """Delete releases but this one and the one before."""
@@ -250,7 +250,7 @@ class Installer:
         self.tell(f"run      {' '.join(command)}")
         if self.is_dry:
             return
-        done = subprocess.run(command, capture_output=True, text=True, timeout=RUN_S)
+        done = run(command)
         if done.returncode:
             said = " ".join((done.stderr or done.stdout).split())
             raise InstallError(f"{' '.join(command)} failed: {said or f'status {done.returncode}'}")

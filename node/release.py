@@ -15,7 +15,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -29,7 +29,7 @@ UNIT_FILES = "systemd"
 CACHES = "__pycache__"
 OF_PIP = frozenset({"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"})
 COMMAND = "import sys\n\nfrom foveascan import main\n\nsys.exit(main())\n"
-TRY_S = 120
+RUN_S = 180
 
 
 def unit_files() -> Path:
@@ -89,6 +89,14 @@ def build(place: Path) -> None:
     except BaseException:
         shutil.rmtree(new, ignore_errors=True)
         raise
+
+
+def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, whatever its status. Raises InstallError when it takes too long, OSError."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=RUN_S)
+    except subprocess.TimeoutExpired:
+        raise InstallError(f"{' '.join(command)} did not end within {RUN_S} s") from None
 
 
 def require_python() -> None:
@@ -160,7 +168,7 @@ def _open_to_all(folder: Path) -> None:
 def _try(new: Path) -> None:
     """Raises InstallError unless the copy runs."""
     command = [str(new / "bin" / "python"), "-I", "-m", OURS, "serve", "--check"]
-    tried = subprocess.run(command, capture_output=True, text=True, timeout=TRY_S)
+    tried = run(command)
     if tried.returncode:
         said = "".join(tried.stderr.strip().splitlines()[-1:])
         raise InstallError(f"the copy does not run: {said}")

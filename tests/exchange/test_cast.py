@@ -241,6 +241,15 @@ def test_an_image_for_a_mesh_without_texture_coordinates_is_refused(tmp_path: Pa
         read_mesh(tmp_path / "ball.ply", texture=np.zeros((4, 4, 3), np.uint8))
 
 
+def test_texture_coordinates_that_no_image_repeats_to_are_refused(tmp_path: Path) -> None:
+    faces = "f 1/1 2/1 3/1\nf 1/1 3/1 4/1\nf 1/1 4/1 2/1\nf 2/1 4/1 3/1\n"
+    corners = "v 0 0 9\nv 5 0 0\nv -5 5 0\nv -5 -5 0\n"
+    for u, message in (("1e30", "texture coordinates: beyond"), ("nan", "not finite")):
+        (tmp_path / "a.obj").write_text(f"{corners}vt {u} 0\n{faces}")
+        with pytest.raises(ExchangeError, match=message):
+            read_mesh(tmp_path / "a.obj", texture=np.zeros((4, 4, 3), np.uint8))
+
+
 def test_parts_stand_where_the_scene_puts_them_and_keep_their_own_textures(tmp_path: Path) -> None:
     scene = untyped.Scene()
     for name, height, colour in (("top", 0.03, 200), ("bottom", 0.0, 50)):

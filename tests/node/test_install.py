@@ -98,7 +98,7 @@ def test_an_update_that_fails_leaves_everything_as_it_was(root: Path, monkeypatc
         raise InstallError("it does not come up")
 
     monkeypatch.setattr(Installer, "_bring_up", fail)
-    monkeypatch.setattr(install.subprocess, "run", lambda *args, **options: None)  # type: ignore[attr-defined]
+    monkeypatch.setattr(install, "run", lambda command: None)
     with pytest.raises(InstallError, match="it does not come up"):
         done(root)
     assert os.readlink(root / "opt/foveascan/bin") == "releases/1/bin"
@@ -137,6 +137,12 @@ def test_a_python_in_a_home_cannot_be_run_by_a_service(monkeypatch: pytest.Monke
             continue
         with pytest.raises(InstallError, match=r"no service sees; make the environment with the system's Python"):
             release.require_python()
+
+
+def test_a_command_that_does_not_end_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(release, "RUN_S", 0.05)
+    with pytest.raises(InstallError, match=r"^sleep 60 did not end within 0\.05 s$"):
+        release.run(["sleep", "60"])
 
 
 def test_a_release_runs_alone_and_holds_no_tools_of_ours(tmp_path: Path) -> None:
