@@ -1,7 +1,8 @@
-"""A serial line (UART, USB serial adapter, pty) as a Port: opened and set up by pyserial, waited for by select.
+"""A serial line (UART, USB serial adapter, pty) as a Port: opened and set up by pyserial, read and written by us.
 
 A device that goes away shows itself in many ways: OSError, SerialException, `termios.error` (which is neither), a line
-that is always ready and always empty, a closed or missing descriptor. All of them become PortLost here.
+that is always ready and always empty, a closed or missing descriptor. All of them become PortLost here. pyserial's own
+reading and writing waits by select, which takes no descriptor above 1023.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from contextlib import contextmanager, suppress
 
 import serial
 
+from drivers.self_pipe import SelfPipe
 from protocol.errors import PortLost
 
 _WRITE_TIMEOUT_S = 2.0
@@ -39,10 +41,12 @@ class SerialPort:
         self._name = path
         self._is_lost = False
         try:
-            self._serial = serial.Serial(path, baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True)
+            self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
         except _GONE as error:
             raise PortLost(f"{path}: cannot open: {_why(error)}") from error
-        self._wake_read, self._wake_write = os.pipe()
+        self._waiting = SelfPipe(self._serial.fileno())
+        self._room = select.poll()
+        self._room.register(self._serial.fileno(), select.POLLOUT)
 
     @property
     def name(self) -> str:
@@ -52,41 +56,39 @@ class SerialPort:
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read. Bytes that arrive a few milliseconds apart are gathered."""
         with self._translated("read"):
-            ready, _, _ = select.select([self._serial.fileno(), self._wake_read], [], [], max(timeout_s, 0.0))
-            if self._wake_read in ready:
-                os.read(self._wake_read, 1)
-                return b""
-            if not ready:
+            if not self._waiting.wait(timeout_s):
                 return b""
             if self._serial.in_waiting < _GATHER_BELOW_BYTES:
                 time.sleep(_GATHER_S)
-            # ready and empty is the end of the line: reading one byte makes pyserial say so
-            return bytes(self._serial.read(min(max(self._serial.in_waiting, 1), max_bytes)))
+            data = os.read(self._serial.fileno(), max_bytes)
+            if not data:
+                raise ConnectionResetError("the line is ready and empty: it has ended")
+            return data
 
     def write(self, data: bytes) -> None:
         """As Port.write; a line that takes nothing for two seconds is lost."""
         with self._translated("write"):
-            self._serial.write(data)
+            rest = memoryview(data)
+            while rest:
+                if not self._room.poll(1000 * _WRITE_TIMEOUT_S):
+                    raise TimeoutError(f"nothing was taken for {_WRITE_TIMEOUT_S:g} s")
+                with suppress(BlockingIOError):
+                    rest = rest[os.write(self._serial.fileno(), rest) :]
 
     def cancel(self) -> None:
         """As Port.cancel."""
-        with suppress(OSError):
-            os.write(self._wake_write, b"x")
+        self._waiting.wake()
 
     def close(self) -> None:
         """As Port.close."""
-        if self._wake_read < 0:
-            return
-        for descriptor in (self._wake_read, self._wake_write):
-            os.close(descriptor)
-        self._wake_read = self._wake_write = -1
+        self._waiting.close()
         with suppress(*_GONE):
             self._serial.close()
 
     @contextmanager
     def _translated(self, doing: str) -> Iterator[None]:
         """Turn every way of being gone into PortLost, for good."""
-        if self._is_lost or self._wake_read < 0:
+        if self._is_lost or self._waiting.is_closed:
             raise PortLost(f"{self._name}: the port is {'lost' if self._is_lost else 'closed'}")
         try:
             yield

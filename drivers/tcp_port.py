@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import select
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 from drivers.address import parse_tcp
+from drivers.self_pipe import SelfPipe
 from protocol.errors import PortLost
 
 _CONNECT_S = 2.0
@@ -30,7 +29,7 @@ class TcpPort:
         except OSError as error:
             why = error.strerror or str(error)
             raise PortLost(f"{address}: cannot connect: {why}; is the scanner there, and on?") from error
-        self._wake_read, self._wake_write = os.pipe()
+        self._waiting = SelfPipe(self._socket.fileno())
 
     @property
     def name(self) -> str:
@@ -40,11 +39,7 @@ class TcpPort:
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read."""
         with self._translated("read"):
-            ready, _, _ = select.select([self._socket.fileno(), self._wake_read], [], [], max(timeout_s, 0.0))
-            if self._wake_read in ready:
-                os.read(self._wake_read, 1)
-                return b""
-            if not ready:
+            if not self._waiting.wait(timeout_s):
                 return b""
             data = self._socket.recv(max_bytes)
             if not data:
@@ -58,22 +53,17 @@ class TcpPort:
 
     def cancel(self) -> None:
         """As Port.cancel."""
-        with suppress(OSError):
-            os.write(self._wake_write, b"x")
+        self._waiting.wake()
 
     def close(self) -> None:
         """As Port.close."""
-        if self._wake_read < 0:
-            return
-        for descriptor in (self._wake_read, self._wake_write):
-            os.close(descriptor)
-        self._wake_read = self._wake_write = -1
+        self._waiting.close()
         self._socket.close()
 
     @contextmanager
     def _translated(self, doing: str) -> Iterator[None]:
         """Turn every way of being gone into PortLost, for good."""
-        if self._lost or self._wake_read < 0:
+        if self._lost or self._waiting.is_closed:
             raise PortLost(f"{self._name}: {self._lost or 'the port is closed'}")
         try:
             yield

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from drivers import serial_port
 from drivers.serial_port import SerialPort
 from protocol.errors import PortLost
 
@@ -100,7 +101,7 @@ def test_a_vanished_terminal_that_reads_as_empty_for_ever_is_lost(line: Line, mo
 
 
 def test_a_line_that_takes_nothing_is_lost(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line.port._serial, "write_timeout", 0.05)
+    monkeypatch.setattr(serial_port, "_WRITE_TIMEOUT_S", 0.05)
     with pytest.raises(PortLost, match="write"):
         line.port.write(bytes(1_000_000))
 
@@ -129,3 +130,20 @@ def test_closing_twice_and_using_a_closed_port(line: Line) -> None:
 def test_closing_an_unplugged_port_is_harmless(line: Line) -> None:
     line.hang_up()
     line.port.close()
+
+
+@pytest.mark.usefixtures("many_open_files")
+def test_a_line_opened_late_by_a_node_with_many_clients_works() -> None:
+    far, near = os.openpty()
+    tty.setraw(near)
+    port = SerialPort(os.ttyname(near))
+    ends = Line(far, port)
+    try:
+        os.write(far, b"ping")
+        assert read_all(port, 4) == b"ping"
+        port.write(b"pong")
+        assert os.read(far, 10) == b"pong"
+    finally:
+        os.close(near)
+        ends.hang_up()
+        port.close()

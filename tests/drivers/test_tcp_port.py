@@ -1,5 +1,6 @@
 """A port over TCP, against the listener of a simulated scanner."""
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -100,3 +101,13 @@ def test_what_is_sent_to_nobody_goes_nowhere(far: TcpListener) -> None:
     far.write(b"hello?")
     with closing(met(far)) as port:
         assert port.read(10, 0.05) == b""
+
+
+@pytest.mark.usefixtures("many_open_files")
+def test_a_connection_made_late_by_a_node_with_many_clients_works() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        with closing(TcpPort(f"tcp:127.0.0.1:{listener.getsockname()[1]}")) as port, listener.accept()[0] as far:
+            far.sendall(b"ping")
+            assert port.read(10, 60) == b"ping"
+            port.write(b"pong")
+            assert far.recv(10) == b"pong"
