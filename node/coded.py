@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from node.state import ClientState
-from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, BoolArray, ImageArray, StepArray
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, VOID, BoolArray, ImageArray, StepArray
 from protocol.lattice import NO_SKIRT, RHO_MAX, RHO_ONE, Channel, Parameters, mask_to_runs
-from protocol.reconstruct import Selection
+from protocol.reconstruct import Selection, range_patch
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
 from protocol.region import Region
 from protocol.strips import Strip, Strips, join_parts, samples_of
@@ -18,11 +19,11 @@ from protocol.strips import Strip, Strips, join_parts, samples_of
 FRAME_BYTES = 10  # WebSocket's own, at most
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Part:
     """What one strip of a refinement carries, encoded.
 
-    decoded : range only, the samples as a client decodes them.
+    decoded, void : range only, the samples as a client decodes them and which cells of its patch are void.
     patch : texture only, the patch that a client makes of it; None where nobody measured it.
     """
 
@@ -30,12 +31,22 @@ class Part:
     payload: bytes
     mask: bytes = b""
     decoded: StepArray | None = None
+    void: BoolArray | None = None
     patch: ImageArray | None = None
 
     @property
     def selection(self) -> Selection:
         """What the strip carries."""
         return self.strip.selection
+
+    @cached_property
+    def range_steps(self) -> StepArray:
+        """The patch that a client makes of a strip's range, voids included. (rows, columns) uint16"""
+        assert self.decoded is not None and self.void is not None  # of range
+        patch = range_patch(self.selection, self.decoded)
+        patch[self.void] = VOID
+        patch.flags.writeable = False
+        return patch
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -169,16 +169,16 @@ class _Planner:
         return _error_in(self._state, self._range_region) * self._scan.spec.step_mm
 
     def _divide(self) -> tuple[RangeParameters, float]:
-        """The range parameters to use and the bytes to keep for them.
+        """The range parameters to use and the bytes to keep for them; none are kept where there is no limit.
 
         Without a limit, or where both qualities fit it: the cheapest that reach the quality. Else the pair that falls
         short the least, a doubled range error counting as much as 6 dB of texture.
         """
         target_steps = self._range.target_steps
         wanted = self._range.choose(target_steps)
-        range_bytes = self._range.expected_bytes(wanted)
         if math.isinf(self._left):
-            return wanted, range_bytes
+            return wanted, 0.0
+        range_bytes = self._range.expected_bytes(wanted)
         best, least = (wanted, range_bytes), self._shortfall(0, range_bytes)
         doubled = 0
         while least > doubled and doubled < DOUBLINGS_MAX:

@@ -18,7 +18,6 @@ from node.coded import Coded, Part, own_inside
 from node.library import Scan
 from node.refine_range import (
     PERCENTILE,
-    client_range,
     code_range_lattice,
     note_range,
     range_lattice,
@@ -59,13 +58,16 @@ def reach_range(
             break
         wanted = RangeParameters(p=wanted.p, quantum=max(wanted.quantum * 3 // 4, 1), s=wanted.s)
         coded = _code_listed(scan, state, region, wanted, apart)
+    first = [coded] if coded is not None else []
+    beyond = _cells_beyond(scan, coded, region, target_steps)
+    kept = touched & ~_of_region(_adopted(held.shape, coded), region)
+    if beyond <= allowed and not kept.any():
+        return first
     after = state.copy()
     if coded is not None:
         note_range(scan, after, coded, target_steps)
-    first = [coded] if coded is not None else []
     poor = after.cells_beyond(target_steps, region)
-    kept = ~_of_region(_adopted(held.shape, coded), region)
-    if poor[kept].sum() + _cells_beyond(scan, coded, region, target_steps) <= allowed:
+    if poor[kept].sum() + beyond <= allowed:
         return first
     worst = _worst(poor, allowed)
     second = _mend(scan, after, region, wanted, target_steps, worst, allowed - int(poor[~worst].sum()))
@@ -148,7 +150,7 @@ def _part_beyond(scan: Scan, part: Part, region: Region, target_steps: float) ->
     selection, inside = part.selection, own_inside(region, part.selection)
     own = slice(0, inside.shape[1])
     truth = np.asarray(cut(scan.range_steps, selection), np.int32)[:, own]
-    far = np.abs(client_range(scan, part)[:, own].astype(np.int32) - truth) > target_steps
+    far = np.abs(part.range_steps[:, own].astype(np.int32) - truth) > target_steps
     far &= (truth != VOID) & selection.adopted_cells() & inside
     return selection.lattice.shape.stride * int(np.count_nonzero(far))
 

@@ -1,6 +1,6 @@
 """The range of one look: spacing and quantum that reach the error asked for, or that fit a limit.
 
-What a quantum leaves and takes is known without coding (protocol.codec_lift.survey), so the choice costs no encode.
+What a quantum leaves and takes is known without coding (protocol.codec_lift.Survey), so the choice costs no encode.
 
 Source: REQUIREMENTS F-14b, E-01.
 """
@@ -49,7 +49,7 @@ class RangeSearch:
 
     def choose(self, target_steps: float) -> RangeParameters:
         """The cheapest parameters that reach a range error, with the skirt asked for."""
-        return self._with_skirt(choose_range(self._trial, target_steps).parameters)
+        return self._with_skirt(choose_range(self._trial, target_steps))
 
     def expected_bytes(self, wanted: RangeParameters, region: Region | None = None) -> float:
         """What range of the window (or of another region) is expected to take on the wire; 0: it is held already."""

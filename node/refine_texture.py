@@ -119,10 +119,12 @@ def _block_errors(scan: Scan, part: Part) -> NDArray[np.float32]:
     """Squared error per value in each block of a measured strip's rectangle."""
     assert part.patch is not None
     selection = part.selection
-    missed = cv2.absdiff(part.patch, np.asarray(cut(scan.texture, selection)))
-    squared = cv2.multiply(missed, missed, dtype=cv2.CV_32F).sum(axis=2)[:, : int(selection.x.size.sum())]
-    starts_y, starts_x = (np.cumsum(window.size) - window.size for window in (selection.y, selection.x))
-    total = np.add.reduceat(np.add.reduceat(squared, starts_y, axis=0), starts_x, axis=1)
+    missed = cv2.absdiff(part.patch, np.asarray(cut(scan.texture, selection)))[:, : int(selection.x.size.sum())]
+    squared = cv2.multiply(missed, missed, dtype=cv2.CV_32F).reshape(len(missed), -1)
+    ends_y, ends_x = (np.cumsum(window.size) for window in (selection.y, selection.x))
+    bands = (squared[end - high : end] for high, end in zip(selection.y.size.tolist(), ends_y.tolist(), strict=True))
+    rows = np.concatenate([cv2.reduce(band, 0, cv2.REDUCE_SUM) for band in bands])
+    total = np.add.reduceat(rows, 3 * (ends_x - selection.x.size), axis=1)
     return np.asarray(total / (3 * np.multiply.outer(selection.y.size, selection.x.size)), np.float32)
 
 

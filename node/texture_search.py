@@ -77,6 +77,7 @@ class TextureSearch:
         self._quick, self._encodes = quick, encodes
         self._target_mse = mse_of_db(look.texture_db)
         self._lowest, self._highest = quality_bounds(codec)
+        self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
         self.limited = False
         self.mse: float | None = None
 
@@ -117,6 +118,11 @@ class TextureSearch:
 
     def _expected(self, p: int, listed: tuple[int, ...] | None) -> Expected:
         """What texture takes at a spacing, and leaves in the window with what is held there."""
+        if (p, listed) not in self._known:
+            self._known[p, listed] = self._expect(p, listed)
+        return self._known[p, listed]
+
+    def _expect(self, p: int, listed: tuple[int, ...] | None) -> Expected:
         if self._model is None:
             return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
         if listed is None:

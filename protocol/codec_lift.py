@@ -11,6 +11,8 @@ escapes", and all of it is deflated.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +50,17 @@ def encode_and_decode(
     return bytes(payload), _clamped(decoded)
 
 
-def survey(range_steps: StepArray, quantum: int, care: BoolArray | None = None) -> tuple[StepArray, float]:
-    """What `decode` will return, and about how many bytes it will take, without coding it."""
-    decoded, missed = _analysed(range_steps, quantum, care)
-    return _clamped(decoded), _expected_bytes(_pack(missed))
+class Survey:
+    """What a payload would be, without coding it; arguments as of `encode`.  decoded : what `decode` will return."""
+
+    def __init__(self, range_steps: StepArray, quantum: int, care: BoolArray | None = None) -> None:
+        decoded, self._missed = _analysed(range_steps, quantum, care)
+        self.decoded = _clamped(decoded)
+
+    @cached_property
+    def expected_bytes(self) -> float:
+        """About how many bytes it will take."""
+        return _expected_bytes(_pack(self._missed))
 
 
 def decode(payload: bytes, shape: tuple[int, int], quantum: int) -> StepArray:

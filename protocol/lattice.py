@@ -327,6 +327,7 @@ def _repeat_edges(at: IntArray, shape: ChannelShape, border: IntArray) -> tuple[
     return at, sample
 
 
+@lru_cache(maxsize=32)
 def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) -> tuple[IntArray, IntArray, IntArray]:
     """Blocks of an axis over several turns: index, first and past-last dense position."""
     size, side = (shape.height, shape.block) if vertical else (shape.own_width, shape.own_block)
@@ -334,7 +335,10 @@ def _turns(shape: ChannelShape, turns: tuple[int, ...], vertical: bool = False) 
     start = index * side
     stop = np.minimum(start + side, size)
     offset = np.repeat(np.asarray(turns, np.int64) * size, index.size)
-    return np.tile(index, len(turns)), np.tile(start, len(turns)) + offset, np.tile(stop, len(turns)) + offset
+    blocks = np.tile(index, len(turns)), np.tile(start, len(turns)) + offset, np.tile(stop, len(turns)) + offset
+    for array in blocks:
+        array.flags.writeable = False
+    return blocks
 
 
 def _cover(

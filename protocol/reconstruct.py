@@ -25,6 +25,8 @@ from protocol.rings import Cells, widened
 
 Number = TypeVar("Number", bound=np.number[Any])
 BAND_ROWS = 256
+_COPIED_MIN = 16  # cells: fewer are interpolated with the others
+_SHIFTED_MAX = 1 << 14  # times the largest step is below 2^31
 LightArray = NDArray[np.float32]
 
 
@@ -148,20 +150,42 @@ def range_patch(selection: Selection, range_steps: StepArray) -> StepArray:
     """Dense range of the windows' rectangle from the transmitted samples, by integer bilinear interpolation.
 
     range_steps : sample_shape uint16, dequantised, without voids.  Returns (rows, columns) uint16.
-    A cell between samples z with integer weights w that add up to d is (2 sum(w z) + d) // (2 d). Every product stays
-    below 2^53, so float64 holds it exactly and its quotient's floor is the integer one.
+    A cell between samples z with integer weights w that add up to d is (2 sum(w z) + d) // (2 d). Where d is the same
+    small power of two everywhere, that is a shift. Else every product stays below 2^53, so float64 holds it exactly and
+    its quotient's floor is the integer one.
     """
     y, x = selection.y, selection.x
     _check_samples(selection, range_steps.shape)
-    columns = _blend(range_steps.T.astype(np.float64), x).T
-    return _round_ratio(_blend(columns, y), np.multiply.outer(y.whole.astype(np.float64), x.whole))
+    d = _even_whole(y) * _even_whole(x)
+    if 0 < d <= _SHIFTED_MAX and d & (d - 1) == 0:
+        weighted = _blend(_blend(range_steps.astype(np.int32), x, 1), y, 0)
+        weighted += d >> 1
+        weighted >>= d.bit_length() - 1
+        return weighted.astype(np.uint16)
+    weighted = _blend(_blend(range_steps.astype(np.float64), x, 1), y, 0)
+    whole_y, whole_x = (np.where(window.part.any(), window.whole, 1).astype(np.float64) for window in (y, x))
+    return _round_ratio(weighted, np.multiply.outer(whole_y, whole_x))
 
 
-def _blend(samples: FloatArray, window: Window) -> FloatArray:
-    """Weighted sums along axis 0, not yet divided: low (whole - part) + high part."""
-    part = window.part[:, None].astype(np.float64)
-    whole = window.whole[:, None].astype(np.float64)
-    return samples[window.low] * (whole - part) + samples[window.high] * part
+def _even_whole(window: Window) -> int:
+    """What all its wholes are; 1 where cells are samples and 0 where wholes differ."""
+    if not window.part.any():
+        return 1
+    return int(window.whole[0]) if (window.whole == window.whole[0]).all() else 0
+
+
+def _blend(samples: NDArray[Any], window: Window, axis: int) -> NDArray[Any]:
+    """Weighted sums along an axis, not yet divided: low (whole - part) + high part; samples where cells are these."""
+    low = samples.take(window.low, axis)
+    if not window.part.any():
+        return low
+    part, whole = (np.expand_dims(number.astype(samples.dtype), 1 - axis) for number in (window.part, window.whole))
+    high = samples.take(window.high, axis)
+    high -= low
+    high *= part
+    low *= whole
+    low += high
+    return low
 
 
 def _round_ratio(numerator: FloatArray, denominator: FloatArray) -> StepArray:
@@ -177,24 +201,52 @@ def texture_patch(selection: Selection, texels: ImageArray) -> ImageArray:
     y, x = selection.y, selection.x
     _check_samples(selection, texels.shape[:2])
     patch = np.empty((y.low.size, x.low.size, 3), np.uint8)
-    part_x, part_y = x.part / x.whole, y.part / y.whole
-    for top in range(0, y.low.size, BAND_ROWS):
-        band = slice(top, top + BAND_ROWS)
-        low, high = y.low[band], y.high[band]
-        few = texels[low[0] : high[-1] + 1].swapaxes(0, 1)
-        columns = _between(few, x.low, x.high, part_x).swapaxes(0, 1)
-        patch[band] = _between(columns, low - low[0], high - low[0], part_y[band]) + np.float32(0.5)
+    rows, columns = _copied(y), _copied(x)
+    patch[rows, columns] = texels[_samples(y, rows), _samples(x, columns)]
+    everywhere = slice(0, x.low.size)
+    for rest in (slice(0, rows.start), slice(rows.stop, y.low.size)):
+        _fill_between(patch, texels, y, x, rest, everywhere)
+    for rest in (slice(0, columns.start), slice(columns.stop, x.low.size)):
+        _fill_between(patch, texels, y, x, rows, rest)
     return patch
 
 
-def _between(samples: ImageArray | LightArray, low: IntArray, high: IntArray, part: FloatArray) -> LightArray:
-    """Linear interpolation along axis 0: samples[low], part (n,) of the way to samples[high]. (n, ..., 3) float32."""
-    source = np.ascontiguousarray(samples, np.float32)
-    start = source[low]
+def _copied(window: Window) -> slice:
+    """The longest run of cells that are samples, one by one; none where that is short."""
+    follows = np.diff(window.low, prepend=-2) == 1
+    breaks = np.flatnonzero(np.concatenate([[True], ~(follows[1:] & (window.part[1:] == 0)), [True]]))
+    longest = int(np.argmax(np.diff(breaks)))
+    start, stop = int(breaks[longest]), int(breaks[longest + 1])
+    start += int(window.part[start] != 0)
+    return slice(start, stop) if stop - start >= _COPIED_MIN else slice(0, 0)
+
+
+def _samples(window: Window, cells: slice) -> slice:
+    """The samples that such a run of cells is."""
+    first = int(window.low[cells.start]) if cells.stop else 0
+    return slice(first, first + cells.stop - cells.start)
+
+
+def _fill_between(patch: ImageArray, texels: ImageArray, y: Window, x: Window, rows: slice, columns: slice) -> None:
+    """Interpolate some rows and columns of a patch."""
+    if columns.start == columns.stop:
+        return
+    part_x, part_y = x.part[columns] / x.whole[columns], y.part / y.whole
+    for top in range(rows.start, rows.stop, BAND_ROWS):
+        band = slice(top, min(top + BAND_ROWS, rows.stop))
+        low, high = y.low[band], y.high[band]
+        few = texels[low[0] : high[-1] + 1].astype(np.float32)
+        across = _between(few, x.low[columns], x.high[columns], part_x, 1)
+        patch[band, columns] = _between(across, low - low[0], high - low[0], part_y[band], 0) + np.float32(0.5)
+
+
+def _between(samples: LightArray, low: IntArray, high: IntArray, part: FloatArray, axis: int) -> LightArray:
+    """Linear interpolation along an axis: samples[low], part (n,) of the way to samples[high]."""
+    start = samples.take(low, axis)
     if part.any():
-        way = source[high]
+        way = samples.take(high, axis)
         way -= start
-        way *= part.astype(np.float32)[:, None, None]
+        way *= np.expand_dims(part.astype(np.float32), (1 - axis, 2))
         start += way
     return start
 

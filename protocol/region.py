@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -43,9 +43,9 @@ class Region:
 
     def blocks(self, side: int) -> tuple[int, int, int, int]:
         """Blocks of the rectangle round it: first column, first row, columns, rows; all round when it meets itself."""
-        first, wide = blocks_touched(np.array([self.left]), np.array([self.width]), side, self.turn)
+        first, wide = _columns_touched(self.left, self.width, side, self.turn)
         top, bottom = self.top // side, (self.top + self.height - 1) // side
-        return int(first[0]), top, int(wide[0]), bottom - top + 1
+        return first, top, wide, bottom - top + 1
 
     def touched(self, side: int) -> BoolArray:
         """Which blocks of that rectangle it touches. (rows, columns) bool"""
@@ -96,6 +96,12 @@ class Cap(Region):
     @cached_property
     def _touched(self) -> dict[int, BoolArray]:
         return {}
+
+
+@lru_cache(maxsize=256)
+def _columns_touched(left: int, width: int, side: int, turn: int) -> tuple[int, int]:
+    first, wide = blocks_touched(np.array([left]), np.array([width]), side, turn)
+    return int(first[0]), int(wide[0])
 
 
 def blocks_touched(left: IntArray, width: IntArray, side: int, turn: int) -> tuple[IntArray, IntArray]:

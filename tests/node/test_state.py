@@ -8,7 +8,6 @@ import pytest
 from node.first_view import build_first_view
 from node.foveate import plan_update
 from node.library import Scan
-from node.refine_range import client_range
 from node.state import ClientState
 from protocol.holdings import ChannelHoldings
 from protocol.lattice import Channel
@@ -68,7 +67,7 @@ def test_cells_beyond_are_counted_as_they_are(scan: Scan) -> None:
     (coded,) = update.coded
     region = region_round(0.5, 0.5, 0.02, scan.spec.width, scan.spec.height)
     (part,) = coded.parts
-    patch, selection = client_range(scan, part), part.selection
+    patch, selection = part.range_steps, part.selection
     dense = np.array(scan.range_steps)
     paste(dense, patch, selection)
     far = np.abs(dense.astype(int) - scan.range_steps) > 0.02 / scan.spec.step_mm

@@ -77,10 +77,10 @@ def test_any_range_returns_within_half_a_quantum(values: StepArray, quantum: int
 def test_lift_surveys_what_it_decodes_to() -> None:
     values = ranges((33, 40))
     care = discs((33, 40))
-    decoded, expected_bytes = codec_lift.survey(values, 300, care)
+    surveyed = codec_lift.Survey(values, 300, care)
     payload = codec_lift.encode(values, 300, care)
-    np.testing.assert_array_equal(decoded, codec_lift.decode(payload, (33, 40), 300))
-    assert 0.5 < expected_bytes / len(payload) < 2
+    np.testing.assert_array_equal(surveyed.decoded, codec_lift.decode(payload, (33, 40), 300))
+    assert 0.5 < surveyed.expected_bytes / len(payload) < 2
 
 
 @settings(max_examples=60, deadline=None)
