@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import statistics
 import sys
 import tempfile
@@ -10,9 +11,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import msgspec
 
 from client import connect
@@ -23,10 +26,12 @@ from tests.bench.viewers import Orders, Report
 
 ROOT = Path(__file__).parents[2]
 SWEPT = "nutcracker"  # another object than the one looked at, so another scan
+SWEEP_SHARE = 0.6  # of the time, at the scanner's pace: what comes after it is to be seen, too
 PLACES = 400
-IDLE_CLICKS = 40
+WARM_CLICKS, IDLE_CLICKS = 8, 40
 STALL_CLICKERS, STALL_S, STALL_ROUNDS = 4, 6.0, 3
 SAMPLE_S = 0.5
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 SETTINGS = """
 [capture]
 scanner = "{scanner}"
@@ -52,34 +57,55 @@ def run(scan: BenchScan, size: str, seconds: float, viewers: int, clickers: int)
     """All figures. seconds : of clicking twice a second. Raises FoveascanError where the viewers cannot be run."""
     with tempfile.TemporaryDirectory(prefix="foveascan-load-") as folder:
         scan.published(Path(folder) / "library")
-        rate = 2.2 * scan.grid.range_steps.nbytes / seconds + 1.1 * scan.grid.texture.nbytes / seconds
+        rate = 1.1 * (2 * scan.grid.range_steps.nbytes + scan.grid.texture.nbytes) / (SWEEP_SHARE * seconds)
         simulate = ["simulate", "--path", f"{folder}/scanner", "--size", size, "--link-rate", f"{rate:.0f}"]
         with started(*simulate, "--specimen", SWEPT, "--json") as (_, scanner):
             (Path(folder) / "node.toml").write_text(SETTINGS.format(scanner=scanner["path"], folder=folder))
             with started("serve", "--config", f"{folder}/node.toml", "--json") as (node, ready):
-                return _measure(ready["url"], node.pid, scan, seconds, viewers, clickers)
+                return _measure(ready["url"], Watched(node.pid), scan, seconds, viewers, clickers)
 
 
-def _measure(url: str, pid: int, scan: BenchScan, seconds: float, viewers: int, clickers: int) -> dict[str, Any]:
-    places = scan.clicks(PLACES)
-    idle = view(Orders(url, 1, 1, IDLE_CLICKS / 2, places))
+def _measure(
+    url: str, node: Watched, scan: BenchScan, seconds: float, viewers: int, clickers: int
+) -> dict[str, Any]:
+    places = scan.clicks(max(int(2 * seconds) * clickers, PLACES))
+    view(Orders(url, 1, 1, WARM_CLICKS / 2, places))
+    asyncio.run(_surveyed(url))
+    with node.watching() as alone:
+        idle = view(Orders(url, 1, 1, IDLE_CLICKS / 2, places))
     stalled = _stalled(url, places)
     swept: dict[str, Any] = {}
     sweeping = threading.Thread(target=lambda: swept.update(asyncio.run(_sweep(url))))
-    with _watched(pid) as memory:
+    with node.watching() as then:
         sweeping.start()
         busy = view(Orders(url, viewers, clickers, seconds, places))
         sweeping.join()
     idle_s, busy_s = statistics.median(idle.latencies_s), sorted(busy.latencies_s)
-    p99_s = busy_s[int(0.99 * (len(busy_s) - 1))]
-    warm, end = memory[len(memory) // 3], memory[-1]
+    p99_s = _percentile(busy_s, 99)
     return {
         "viewers": viewers, "clickers": clickers, "seconds": seconds, "clicks": len(busy_s),
         "superseded": busy.superseded, "errors": idle.errors + busy.errors, "sent_mb": busy.size_bytes / 1e6,
-        "idle_median_s": idle_s, "busy_median_s": statistics.median(busy_s), "busy_p99_s": p99_s,
-        "p99_to_idle": p99_s / idle_s, "memory_mb": {"warm": warm, "end": end, "most": max(memory)},
-        "sweep": swept, "stalled_reader": stalled,
+        "idle_median_s": idle_s, "busy_median_s": statistics.median(busy_s), "busy_p95_s": _percentile(busy_s, 95),
+        "busy_p99_s": p99_s, "p99_to_idle": p99_s / idle_s,
+        "cpu": {
+            "node_idle_ms_a_click": 1000 * alone.cpu_s / len(idle.latencies_s),
+            "node_busy_ms_an_answer": 1000 * then.cpu_s / max(len(busy_s) - busy.superseded, 1),
+            "node_cores": then.cpu_s / then.seconds, "viewers_cores": busy.cpu_s / seconds,
+            "viewers_late_p99_s": _percentile(sorted(busy.late_s), 99),
+        },
+        "memory_mb": then.memory_mb(), "sweep": swept, "stalled_reader": stalled,
     }  # fmt: skip
+
+
+def _percentile(ascending: list[float], percent: int) -> float:
+    return ascending[percent * (len(ascending) - 1) // 100]
+
+
+async def _surveyed(url: str) -> None:
+    """Wait until the scan's texture is measured: a node that was started yesterday has done so."""
+    async with aiohttp.ClientSession() as http:
+        while (await (await http.get(f"{url}/v1/node")).json())["surveying"]:
+            await asyncio.sleep(0.2)
 
 
 def _stalled(url: str, places: list[tuple[float, float]]) -> dict[str, float]:
@@ -119,40 +145,74 @@ def view(orders: Orders) -> Report:
     return msgspec.json.decode(done.stdout, type=Report)
 
 
-@contextmanager
-def _watched(pid: int) -> Iterator[list[float]]:
-    """A process's resident memory, every half second. [MB]"""
-    samples = [_memory_mb(pid)]
-    done = threading.Event()
+@dataclass
+class Watching:
+    """What a process took in a while.  resident, own : memory at each moment, all of it and what no file backs. [MB]"""
 
-    def watch() -> None:
-        while not done.wait(SAMPLE_S):
-            samples.append(_memory_mb(pid))
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    resident: list[float] = field(default_factory=list)
+    own: list[float] = field(default_factory=list)
 
-    watching = threading.Thread(target=watch)
-    watching.start()
-    try:
-        yield samples
-    finally:
-        done.set()
-        watching.join()
+    def memory_mb(self) -> dict[str, float]:
+        """Memory at the start, after each third of the time, and at most."""
+        at = {"start": 0, "third": len(self.own) // 3, "two_thirds": 2 * len(self.own) // 3, "end": -1}
+        return {**{name: self.own[index] for name, index in at.items()}, "most_resident": max(self.resident)}
 
 
-def _memory_mb(pid: int) -> float:
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
+class Watched:
+    """A process whose memory and processor time are looked at."""
+
+    def __init__(self, pid: int) -> None:
+        self._folder = Path(f"/proc/{pid}")
+
+    @contextmanager
+    def watching(self) -> Iterator[Watching]:
+        """Look every half second as long as the context lasts; the sums are there behind it."""
+        watching, done = Watching(), threading.Event()
+        began_s, began_cpu_s = time.monotonic(), self._cpu_s()
+
+        def watch() -> None:
+            while not done.wait(SAMPLE_S):
+                self._look(watching)
+
+        self._look(watching)
+        thread = threading.Thread(target=watch)
+        thread.start()
+        try:
+            yield watching
+        finally:
+            done.set()
+            thread.join()
+            self._look(watching)
+            watching.seconds, watching.cpu_s = time.monotonic() - began_s, self._cpu_s() - began_cpu_s
+
+    def _look(self, watching: Watching) -> None:
+        resident, shared = (int(pages) for pages in (self._folder / "statm").read_text().split()[1:3])
+        watching.resident.append(resident * PAGE_BYTES / 1e6)
+        watching.own.append((resident - shared) * PAGE_BYTES / 1e6)
+
+    def _cpu_s(self) -> float:
+        user, system = (self._folder / "stat").read_text().rpartition(")")[2].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def told(record: dict[str, Any]) -> str:
     """The figures for people."""
-    memory, stalled, sweep = record["memory_mb"], record["stalled_reader"], record["sweep"]
+    memory, stalled, sweep, cpu = (record[name] for name in ("memory_mb", "stalled_reader", "sweep", "cpu"))
     return "\n".join([
         f"{record['viewers']} viewers, {record['clickers']} clicking twice a second for {record['seconds']:g} s: "
         f"{record['clicks']} clicks, {record['superseded']} overtaken by the next, {len(record['errors'])} errors",
         f"click to last byte: {1e3 * record['idle_median_s']:.0f} ms alone, {1e3 * record['busy_median_s']:.0f} ms "
-        f"then, 99th percentile {1e3 * record['busy_p99_s']:.0f} ms, {record['p99_to_idle']:.1f} times",
-        f"memory of the node: {memory['warm']:.0f} MB after a third of the time, {memory['end']:.0f} MB at the end, "
-        f"{memory['most']:.0f} MB at most",
+        f"then, 95th percentile {1e3 * record['busy_p95_s']:.0f} ms, 99th {1e3 * record['busy_p99_s']:.0f} ms, "
+        f"{record['p99_to_idle']:.1f} times that alone",
+        f"processor time of the node: {cpu['node_idle_ms_a_click']:.0f} ms a click alone, "
+        f"{cpu['node_busy_ms_an_answer']:.0f} ms an answer then, {cpu['node_cores']:.2f} cores; "
+        f"the viewers took {cpu['viewers_cores']:.2f} cores and clicked {1e3 * cpu['viewers_late_p99_s']:.0f} ms late "
+        f"(99th percentile)",
+        f"memory of the node but for mapped files: {memory['start']:.0f} MB before, {memory['third']:.0f} and "
+        f"{memory['two_thirds']:.0f} MB after each third, {memory['end']:.0f} MB at the end; all of it at most "
+        f"{memory['most_resident']:.0f} MB",
         f"the sweep meanwhile: {sweep['seconds']:.0f} s, {sweep['requested_columns']} columns asked for again, "
         f"{sweep['dropped_bytes']} bytes dropped, {sweep['holes']} holes",
         f"a stalled reader costs the others {100 * stalled['cost']:.0f}%",

@@ -40,11 +40,16 @@ class Orders(msgspec.Struct):
 
 
 class Report(msgspec.Struct):
-    """latencies_s : from each click to the last byte of the first answer that came for it or for a later one."""
+    """latencies_s : from each click to the last byte of the first answer that came for it or for a later one.
+
+    late_s : how late each click was made.  cpu_s : processor time of the viewers themselves, while they clicked.
+    """
 
     latencies_s: list[float]
     superseded: int
     size_bytes: int
+    late_s: list[float]
+    cpu_s: float
     errors: list[str]
 
 
@@ -57,6 +62,7 @@ class Viewer:
         self._waiting: dict[int, float] = {}
         self._request = 0
         self.latencies_s: list[float] = []
+        self.late_s: list[float] = []
         self.superseded = 0
         self.size_bytes = 0
 
@@ -129,6 +135,7 @@ async def view(orders: Orders) -> Report:
         stalled = [await _stall(http, orders.url) for _ in range(orders.stalled)]
         clickers = viewers[: orders.clickers]
         listeners = [asyncio.create_task(viewer.listen()) for viewer in viewers]
+        begun_s = time.process_time()
         errors = await asyncio.gather(
             *(_click(viewer, number, orders) for number, viewer in enumerate(clickers)), return_exceptions=True
         )
@@ -140,6 +147,8 @@ async def view(orders: Orders) -> Report:
             [latency for viewer in clickers for latency in viewer.latencies_s],
             sum(viewer.superseded for viewer in clickers),
             sum(viewer.size_bytes for viewer in viewers),
+            [late for viewer in clickers for late in viewer.late_s],
+            time.process_time() - begun_s,
             [repr(error) for error in (*errors, *broken) if error is not None],
         )
 
@@ -167,7 +176,9 @@ async def _click(viewer: Viewer, number: int, orders: Orders) -> None:
     draw = np.random.default_rng((orders.seed, number))
     began_s = time.monotonic() + orders.period_s * number / max(orders.clickers, 1)
     for turn in range(int(orders.seconds / orders.period_s)):
-        await asyncio.sleep(max(0.0, began_s + turn * orders.period_s - time.monotonic()))
+        due_s = began_s + turn * orders.period_s
+        await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+        viewer.late_s.append(time.monotonic() - due_s)
         await viewer.click(*orders.places[draw.integers(len(orders.places))])
     await viewer.settle()
 
