@@ -5,13 +5,13 @@ import {
   ShaderMaterial,
 } from 'three';
 import type { IUniform } from 'three';
-import { SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
+import { definesOf, SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
 
 export type Uniforms = Record<string, IUniform>;
 
 /** Instances of a part, at one stride, of a surface whose textures are shared. */
 export function gridMesh(
-  { position, index }: Part, stride: number, instances: number, shared: Uniforms, isFan = false,
+  { position, index }: Part, stride: number, instances: number, shared: Uniforms, sphere: boolean, isFan = false,
 ): Mesh<InstancedBufferGeometry, ShaderMaterial> {
   const geometry = new InstancedBufferGeometry();
   geometry.setAttribute('position', position);
@@ -23,7 +23,7 @@ export function gridMesh(
   geometry.instanceCount = 0;
   const material = new ShaderMaterial({
     vertexShader: SURFACE_VERTEX, fragmentShader: SURFACE_FRAGMENT, glslVersion: GLSL3, side: DoubleSide, blending: NoBlending,
-    uniforms: { ...shared, uStride: { value: stride }, uFan: { value: isFan } },
+    uniforms: { ...shared, uStride: { value: stride }, uFan: { value: isFan } }, defines: definesOf(sphere),
   });
   const mesh = new Mesh(geometry, material);
   mesh.frustumCulled = false;

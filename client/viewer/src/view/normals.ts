@@ -8,7 +8,7 @@ import type { DataTexture, WebGLRenderer } from 'three';
 import type { Changed } from '../protocol/model.ts';
 import { compile } from './compile.ts';
 import type { Uniforms } from './grid_mesh.ts';
-import { COPY_FRAGMENT, NORMALS_FRAGMENT, QUAD_VERTEX } from './shaders.ts';
+import { COPY_FRAGMENT, definesOf, NORMALS_FRAGMENT, QUAD_VERTEX } from './shaders.ts';
 
 /** Differences of a normal reach this far beyond the samples that changed. */
 const REACH = 24;
@@ -27,11 +27,11 @@ export class Normals {
    */
   constructor(
     private readonly renderer: WebGLRenderer, private readonly width: number, private readonly height: number,
-    private readonly uniforms: Uniforms, level: DataTexture, spacing: number,
+    private readonly uniforms: Uniforms, private readonly sphere: boolean, level: DataTexture, spacing: number,
   ) {
     const stride = Math.max(1, spacing / 2);
-    this.pass = new Pass(NORMALS_FRAGMENT, { ...uniforms, uLevel: { value: level }, uCell: { value: new Vector2(1, 1) } });
-    this.copy = new Pass(COPY_FRAGMENT, { uFrom: { value: null }, uSize: uniforms['uSize']! });
+    this.pass = new Pass(NORMALS_FRAGMENT, sphere, { ...uniforms, uLevel: { value: level }, uCell: { value: new Vector2(1, 1) } });
+    this.copy = new Pass(COPY_FRAGMENT, false, { uFrom: { value: null }, uSize: uniforms['uSize']! });
     this.target = targetOf(Math.ceil(width / stride), Math.ceil(height / stride));
     uniforms['uNormals']!.value = this.target.texture;
   }
@@ -87,7 +87,7 @@ export class Normals {
 
   /** The same round: on a sphere, columns of these rows are as narrow as the ring next to a pole is short. */
   private reachRound(top: number, bottom: number): number {
-    if (!this.uniforms['uSphere']!.value) return REACH;
+    if (!this.sphere) return REACH;
     const ring = Math.min(Math.sin((Math.PI * top) / this.height), Math.sin((Math.PI * bottom) / this.height));
     return Math.min(Math.ceil(REACH / Math.max(ring, 1e-6)), this.width);
   }
@@ -123,11 +123,12 @@ class Pass {
   private readonly camera = new Camera();
   private readonly quad: Mesh<BufferGeometry, ShaderMaterial>;
 
-  constructor(fragmentShader: string, readonly uniforms: Uniforms) {
+  constructor(fragmentShader: string, sphere: boolean, readonly uniforms: Uniforms) {
     const geometry = new BufferGeometry();
     geometry.setAttribute('position', new BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
     const material = new ShaderMaterial({
       vertexShader: QUAD_VERTEX, fragmentShader, glslVersion: GLSL3, blending: NoBlending, depthTest: false, depthWrite: false, uniforms,
+      defines: definesOf(sphere),
     });
     this.quad = new Mesh(geometry, material);
     this.quad.frustumCulled = false;

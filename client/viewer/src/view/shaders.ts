@@ -1,5 +1,10 @@
 // Range in the vertex shader, normals from the range, colour where it is refined over colour of the first view.
 // A sphere's directions are found again at each pixel: near a pole nothing else is the same all over a triangle.
+// What only spheres need is compiled only for them (SPHERE): a processor that draws takes all branches at every pixel,
+// and half a second to compile those of the normals.
+
+/** What is compiled in. */
+export const definesOf = (sphere: boolean): Record<string, string> => (sphere ? { SPHERE: '' } : {});
 
 /** What every stage needs of the grid. */
 const GRID = /* glsl */ `
@@ -10,17 +15,19 @@ uniform usampler2D uRange;
 uniform ivec2 uSize;
 uniform float uStepMm;
 uniform float uPitchMm;
-uniform bool uSphere;
 const float TURN = 6.283185307179586;
 const float HALF_TURN = 3.141592653589793;
 
-/* Any column and row as one of the grid's: past a pole down the other side. */
+/* Any column up to a turn away, and any row, as one of the grid's: past a pole down the other side. */
 ivec2 inside(int column, int row) {
-  if (uSphere && (row < 0 || row >= uSize.y)) {
+#ifdef SPHERE
+  if (row < 0 || row >= uSize.y) {
     column += uSize.x / 2;
     row = row < 0 ? -1 - row : 2 * uSize.y - 1 - row;
   }
-  return ivec2((column % uSize.x + uSize.x) % uSize.x, clamp(row, 0, uSize.y - 1));
+#endif
+  column += column < 0 ? uSize.x : column < uSize.x ? 0 : -uSize.x; // dividing takes a processor far longer
+  return ivec2(column, clamp(row, 0, uSize.y - 1));
 }
 
 uint stepsAt(int column, int row) {
@@ -47,8 +54,7 @@ out vec2 vUv;
 out vec3 vWorld;
 
 int snapped(int along, float stride) {
-  int step = int(stride);
-  return along - along % step;
+  return along & -int(stride);
 }
 
 float radiusSteps(int column, int row) {
@@ -66,30 +72,34 @@ float radiusSteps(int column, int row) {
 }
 
 vec3 placed(float radius, float angle, float row) {
-  float polar = HALF_TURN * row / float(uSize.y);
-  float level = uSphere ? radius * sin(polar) : radius;
-  float up = uSphere ? radius * cos(polar) : -row * uPitchMm;
+#ifdef SPHERE
+  float polar = HALF_TURN * row / float(uSize.y), level = radius * sin(polar), up = radius * cos(polar);
+#else
+  float level = radius, up = -row * uPitchMm;
+#endif
   return vec3(level * cos(angle), uZMaxMm + up, -level * sin(angle));
 }
 
 void main() {
   int last = uTile / uStride;
   ivec2 vertex = ivec2(position.xy);
-  bool below = uFan && tile.y > 0.5;
   int column = int(tile.x) + vertex.x * uStride;
   int row = int(tile.y) + vertex.y * uStride;
+  if (vertex.x == 0) row = snapped(row, edges.x);
+  if (vertex.x == last) row = snapped(row, edges.y);
+  if (vertex.y == 0) column = snapped(column, edges.z);
+  if (vertex.y == last) column = snapped(column, edges.w);
+  bool pole = false, below = false;
+#ifdef SPHERE
   if (uFan) {
+    below = tile.y > 0.5;
+    pole = position.z > 0.5;
     column = int(tile.x) + (below ? last - vertex.x : vertex.x) * uStride;
     row = below ? uSize.y - 1 : 0;
-  } else {
-    if (vertex.x == 0) row = snapped(row, edges.x);
-    if (vertex.x == last) row = snapped(row, edges.y);
-    if (vertex.y == 0) column = snapped(column, edges.z);
-    if (vertex.y == last) column = snapped(column, edges.w);
   }
+#endif
   column = min(column, uSize.x);
   row = min(row, uSize.y - 1);
-  bool pole = position.z > 0.5;
   float steps = pole ? (below ? uPoles.y : uPoles.x) : radiusSteps(column, row);
   float angle = uTheta0 + TURN * (float(column) + 0.5) / float(uSize.x);
   vec3 local = placed(steps * uStepMm, angle, pole ? (below ? float(uSize.y) : 0.0) : float(row) + 0.5);
@@ -108,7 +118,6 @@ uniform sampler2D uCoarse;
 uniform sampler2D uDense;
 uniform usampler2D uLevel;
 uniform vec2 uLevelScale;
-uniform bool uSphere;
 uniform float uZMaxMm;
 uniform float uTheta0;
 uniform vec3 uKey;
@@ -121,24 +130,17 @@ out vec4 colour;
 const float TURN = 6.283185307179586;
 const float HALF_TURN = 3.141592653589793;
 
-/* What is in a pixel: its place on the scan, how that changes across it, and which way is out, round and up there. */
+/* What is in a pixel: its place on the scan, and which way is out, round and up there. */
 struct Place {
   vec2 uv;
-  vec2 dx;
-  vec2 dy;
   vec3 outward;
   vec3 round;
   vec3 up;
 };
 
-Place onCylinder() {
-  float angle = uTheta0 + TURN * vUv.x;
-  vec3 outward = vec3(cos(angle), 0.0, -sin(angle)), round = vec3(-sin(angle), 0.0, -cos(angle));
-  return Place(vUv, dFdx(vUv), dFdy(vUv), outward, round, vec3(0.0, 1.0, 0.0));
-}
-
+#ifdef SPHERE
 /* Lengths along a ring count as on the equator: else the texture would be blurred ever more towards a pole. */
-Place onSphere() {
+Place place(out vec4 dense) {
   vec3 outward = normalize(vWorld - vec3(0.0, uZMaxMm, 0.0));
   float level = length(outward.xz);
   vec2 across = level > 0.0 ? vec2(outward.x, -outward.z) / level : vec2(1.0, 0.0);
@@ -146,15 +148,20 @@ Place onSphere() {
   vec2 uv = vec2(fract((atan(across.y, across.x) - uTheta0) / TURN), atan(level, outward.y) / HALF_TURN);
   vec3 dx = dFdx(outward), dy = dFdy(outward);
   mat2x3 along = mat2x3(round / TURN, up / -HALF_TURN);
-  return Place(uv, dx * along, dy * along, outward, round, up);
+  dense = textureGrad(uDense, uv, dx * along, dy * along);
+  return Place(uv, outward, round, up);
 }
-
-vec3 toLinear(vec3 c) {
-  return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), step(0.04045, c));
+#else
+Place place(out vec4 dense) {
+  vec2 across = normalize(vWorld.xz);
+  dense = texture(uDense, vUv);
+  return Place(vUv, vec3(across.x, 0.0, across.y), vec3(across.y, 0.0, -across.x), vec3(0.0, 1.0, 0.0));
 }
+#endif
 
-vec3 toSrgb(vec3 c) {
-  return mix(c * 12.92, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
+/* What a light does to a colour as the screen has it: the power law between them, as a root, which costs little. */
+vec3 lit(vec3 texel, vec3 light) {
+  return texel * (1.1404 * sqrt(light) - 0.1402 * light);
 }
 
 /* Sharp is clear, coarse is warm: spacing 1, 2, 4, 8 and more. */
@@ -164,22 +171,20 @@ vec3 spacingColour(float level) {
 }
 
 void main() {
-  Place at;
-  if (uSphere) at = onSphere();
-  else at = onCylinder();
+  vec4 dense;
+  Place at = place(dense);
   vec4 packed = textureLod(uNormals, at.uv, 0.0);
   if (packed.a < 0.5) discard;
   vec3 along = normalize(packed.rgb / packed.a * 2.0 - 1.0);
-  vec3 normal = normalize(along.x * at.outward + along.y * at.round + along.z * at.up);
+  vec3 normal = along.x * at.outward + along.y * at.round + along.z * at.up;
   vec3 view = normalize(cameraPosition - vWorld);
   bool inside = !gl_FrontFacing;
   if (inside) normal = -normal;
 
-  vec4 dense = textureGrad(uDense, at.uv, at.dx, at.dy);
   vec4 coarse = textureLod(uCoarse, at.uv, 0.0);
   vec3 texel = mix(coarse.rgb / max(coarse.a, 0.01), dense.rgb / max(dense.a, 0.01), step(0.5, dense.a));
   if (coarse.a < 0.01) texel = vec3(0.72);
-  vec3 albedo = uMode == 1 ? vec3(0.58, 0.57, 0.55) : toLinear(texel);
+  if (uMode == 1) texel = vec3(0.785, 0.779, 0.766);
   if (uMode == 2 && !inside) {
     colour = vec4(texel, 1.0);
   } else {
@@ -188,11 +193,10 @@ void main() {
     float fill = max(0.0, dot(normal, uFill));
     float sky = 0.5 + 0.5 * normal.y;
     vec3 light = vec3(1.0, 0.975, 0.94) * 0.78 * key + vec3(0.86, 0.92, 1.0) * 0.16 * fill + mix(0.13, 0.27, sky);
-    vec3 halfway = normalize(uKey + view);
-    float gloss = (uMode == 1 ? 0.06 : 0.025) * pow(max(0.0, dot(normal, halfway)), 24.0);
-    vec3 lit = albedo * light + gloss;
-    if (inside) lit *= 0.35;
-    colour = vec4(toSrgb(clamp(lit, 0.0, 1.0)), 1.0);
+    float facing = max(0.0, dot(normal, normalize(uKey + view)));
+    float squared = facing * facing, eighth = squared * squared * squared * squared;
+    float gloss = (uMode == 1 ? 0.045 : 0.018) * eighth * eighth * eighth;
+    colour = vec4(clamp((lit(texel, light) + gloss) * (inside ? 0.65 : 1.0), 0.0, 1.0), 1.0);
   }
   if (uOverlay > 0.0) {
     float level = float(texelFetch(uLevel, ivec2(vec2(fract(at.uv.x), min(at.uv.y, 0.99999)) * uLevelScale), 0).r);
@@ -223,12 +227,21 @@ out vec4 packed;
 const int TAPS = 4;
 
 int levelAt(int column, int row) {
-  return int(texelFetch(uLevel, inside(column, row) / 8, 0).r);
+  return int(texelFetch(uLevel, inside(column, row) >> 3, 0).r);
 }
 
+/* Steps from the middle to a side, or half of what it is from one side to the other. */
+float difference(float before, float here, float after) {
+  float sides = float(before > 0.0) + float(after > 0.0);
+  if (sides == 0.0) return 0.0;
+  return ((after > 0.0 ? after : here) - (before > 0.0 ? before : here)) / sides;
+}
+
+/* Slopes round and down, in steps for an angle of 1 on the equator and for a row. */
+#ifdef SPHERE
 /* How much narrower columns are than on the equator. */
 float ringAt(int row) {
-  return uSphere ? sin(HALF_TURN * (float(row) + 0.5) / float(uSize.y)) : 1.0;
+  return sin(HALF_TURN * (float(row) + 0.5) / float(uSize.y));
 }
 
 /* Steps of a sample, of some beside it too where columns are narrow. */
@@ -247,38 +260,44 @@ float meanSteps(ivec2 at, int reach) {
 
 /* Steps at a neighbour, or 0 where none is, or only a coarser guess: that would draw a scar round what is sharp. */
 float known(int column, int row, int level, int reach) {
-  if (!uSphere && (row < 0 || row >= uSize.y) || levelAt(column, row) > level + 1) return 0.0;
-  return meanSteps(inside(column, row), reach);
+  return levelAt(column, row) > level + 1 ? 0.0 : meanSteps(inside(column, row), reach);
 }
 
-/* The same between two rows. */
-float knownBetween(int column, float row, int level, int reach) {
-  int above = int(floor(row));
-  float upper = known(column, above, level, reach), lower = known(column, above + 1, level, reach);
-  return upper > 0.0 && lower > 0.0 ? mix(upper, lower, row - float(above)) : max(upper, lower);
-}
-
-/* Steps from the middle to a side, or half of what it is from one side to the other. */
-float difference(float before, float here, float after) {
-  float sides = float(before > 0.0) + float(after > 0.0);
-  if (sides == 0.0) return 0.0;
-  return ((after > 0.0 ? after : here) - (before > 0.0 ? before : here)) / sides;
-}
-
-/* Slope along the ring, in steps for an angle of 1 on the equator. */
-float roundSlope(ivec2 at, int level, int reach, float here) {
-  float ring = ringAt(at.y);
-  if (ring > 0.5) {
-    int across = int(float(reach) / ring + 0.5);
-    float turn = TURN * float(across) / float(uSize.x) * ring;
-    return difference(known(at.x - across, at.y, level, 0), here, known(at.x + across, at.y, level, 0)) / turn;
+vec2 slopes(ivec2 at, int level, int reach) {
+  float ring = ringAt(at.y), angle = TURN * float(int(float(reach) / ring + 0.5)) / float(uSize.x) * ring;
+  vec2 beside = vec2(int(float(reach) / ring + 0.5), at.y);
+  if (ring <= 0.5) {
+    float polar = HALF_TURN * (float(at.y) + 0.5) / float(uSize.y);
+    angle = HALF_TURN * float(reach) / float(uSize.y);
+    vec3 along = vec3(ring * cos(angle), sin(angle), cos(polar) * cos(angle));
+    float row = atan(length(along.xy), along.z) / HALF_TURN * float(uSize.y) - 0.5;
+    beside = vec2(int(atan(along.y, along.x) / TURN * float(uSize.x) + 0.5), row);
   }
-  float polar = HALF_TURN * (float(at.y) + 0.5) / float(uSize.y), arc = HALF_TURN * float(reach) / float(uSize.y);
-  vec3 beside = vec3(ring * cos(arc), sin(arc), cos(polar) * cos(arc));
-  float row = atan(length(beside.xy), beside.z) / HALF_TURN * float(uSize.y) - 0.5;
-  int across = int(atan(beside.y, beside.x) / TURN * float(uSize.x) + 0.5);
-  return difference(knownBetween(at.x - across, row, level, reach), here, knownBetween(at.x + across, row, level, reach)) / arc;
+  // One loop, since whatever is called is compiled anew at each call.
+  float steps[5];
+  for (int k = 0; k < 5; k++) {
+    int column = at.x + (k == 0 ? -1 : k == 1 ? 1 : 0) * int(beside.x);
+    float row = k < 2 ? beside.y : float(at.y + (k == 2 ? -1 : k == 3 ? 1 : 0) * reach), above = floor(row);
+    float two[2];
+    for (int j = 0; j < 2; j++) two[j] = known(column, int(above) + j, level, k < 2 && ring > 0.5 ? 0 : reach);
+    float lower = row == above ? 0.0 : two[1];
+    steps[k] = two[0] > 0.0 && lower > 0.0 ? mix(two[0], lower, row - above) : max(two[0], lower);
+  }
+  return vec2(difference(steps[0], steps[4], steps[1]) / angle, difference(steps[2], steps[4], steps[3]) / float(reach));
 }
+#else
+/* Steps at a neighbour, or 0 where none is, or only a coarser guess: that would draw a scar round what is sharp. */
+float known(int column, int row, int level) {
+  return row < 0 || row >= uSize.y || levelAt(column, row) > level + 1 ? 0.0 : float(stepsAt(column, row));
+}
+
+vec2 slopes(ivec2 at, int level, int reach) {
+  float here = float(stepsAt(at.x, at.y)), angle = TURN * float(reach) / float(uSize.x);
+  float round = difference(known(at.x - reach, at.y, level), here, known(at.x + reach, at.y, level));
+  float down = difference(known(at.x, at.y - reach, level), here, known(at.x, at.y + reach, level));
+  return vec2(round / angle, down / float(reach));
+}
+#endif
 
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy * uCell);
@@ -288,11 +307,13 @@ void main() {
     return;
   }
   int level = levelAt(at.x, at.y);
-  int reach = max(1, int(exp2(0.5 * float(level)) + 0.5));
-  float rowMm = uSphere ? HALF_TURN * here * uStepMm / float(uSize.y) : uPitchMm;
-  float mean = meanSteps(at, reach);
-  float down = difference(known(at.x, at.y - reach, level, reach), mean, known(at.x, at.y + reach, level, reach));
-  vec3 normal = normalize(vec3(1.0, -roundSlope(at, level, reach, mean) / here, down * uStepMm / (rowMm * float(reach))));
+  vec2 slope = slopes(at, level, max(1, int(exp2(0.5 * float(level)) + 0.5)));
+#ifdef SPHERE
+  float rowMm = HALF_TURN * here * uStepMm / float(uSize.y);
+#else
+  float rowMm = uPitchMm;
+#endif
+  vec3 normal = normalize(vec3(1.0, -slope.x / here, slope.y * uStepMm / rowMm));
   packed = vec4(normal * 0.5 + 0.5, 1.0);
 }
 `;

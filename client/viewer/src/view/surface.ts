@@ -61,18 +61,18 @@ export class Surface {
     this.uniforms = {
       uRange: { value: this.range }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
       uPitchMm: { value: info.pitchMm }, uZMaxMm: { value: info.zMaxMm }, uTheta0: { value: info.theta0Rad },
-      uSphere: { value: isSphere(info) }, uPoles: { value: new Vector2() },
-      uTile: { value: tileSide }, uNormals: { value: null }, uCoarse: { value: this.coarse },
+      uPoles: { value: new Vector2() }, uTile: { value: tileSide }, uNormals: { value: null }, uCoarse: { value: this.coarse },
       uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
       uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
     };
     this.tiles = new Tiles(info, tileSide);
-    this.meshes = STRIDES.map((stride) => gridMesh(tileGrid(tileSide / stride), stride, this.tiles.count, this.uniforms));
-    this.fans = isSphere(info) ? STRIDES.map((stride) => gridMesh(fan(tileSide / stride), stride, 2 * this.tiles.across, this.uniforms, true)) : [];
+    const sphere = isSphere(info);
+    this.meshes = STRIDES.map((stride) => gridMesh(tileGrid(tileSide / stride), stride, this.tiles.count, this.uniforms, sphere));
+    this.fans = sphere ? STRIDES.map((stride) => gridMesh(fan(tileSide / stride), stride, 2 * this.tiles.across, this.uniforms, true, true)) : [];
     this.object.add(...this.meshes, ...this.fans);
     this.closePoles();
     this.tiles.update(this.steps, snapshot.levels[0]);
-    this.normals = new Normals(renderer, width, height, this.uniforms, this.levels[0], spacingOf(snapshot.levels[0]));
+    this.normals = new Normals(renderer, width, height, this.uniforms, sphere, this.levels[0], spacingOf(snapshot.levels[0]));
   }
 
   /** Have all programs compiled; meanwhile nothing is drawn. */
