@@ -113,7 +113,7 @@ export class App {
         this.sweep.ended(said.scan, said.why);
         break;
       case 'thumbnail':
-        this.scans.picture(said.scan, said);
+        this.scans.picture(said.scan, said.picture);
         break;
       case 'traffic':
         this.cost.traffic(said.received);

@@ -69,5 +69,5 @@ export type FromWorker =
   | { kind: 'livePicture'; steps: Uint16Array; texels: Uint8Array }
   | { kind: 'liveProgress'; percent: number; secondsLeft: number | null }
   | { kind: 'liveEnded'; scan: string | null; why: string }
-  | { kind: 'thumbnail'; scan: string; side: number; pixels: Uint8ClampedArray<ArrayBuffer> }
+  | { kind: 'thumbnail'; scan: string; picture: Blob | null }
   | { kind: 'traffic'; received: number; sent: number };

@@ -28,11 +28,20 @@ const codecs = new Codecs(() => htj2k, decodeJpegNatively);
 let stream: Stream | null = null;
 let origin = '';
 
+// Small pictures wait until the large one can be drawn, or will not be.
+let begin = (): void => undefined;
+let pictures = new Promise<void>((resolve) => (begin = resolve));
+
+function tell(said: FromWorker, transfer?: Transferable[]): void {
+  scope.postMessage(said, transfer);
+  if (said.kind === 'opened' || said.kind === 'refused' || (said.kind === 'link' && said.link.state === 'lost')) begin();
+}
+
 scope.onmessage = ({ data: said }) => {
   switch (said.kind) {
     case 'start':
       origin = said.origin;
-      stream = new Stream(`${origin.replace(/^http/, 'ws')}/v1/stream`, codecs, (...told) => scope.postMessage(...told), explain);
+      stream = new Stream(`${origin.replace(/^http/, 'ws')}/v1/stream`, codecs, tell, explain);
       if (said.scan) stream.open(said.scan);
       stream.connect();
       break;
@@ -52,7 +61,7 @@ scope.onmessage = ({ data: said }) => {
       stream?.connect();
       break;
     case 'thumbnail':
-      void thumbnail(said.scan);
+      pictures = pictures.then(() => thumbnail(said.scan));
       break;
   }
 };
@@ -69,20 +78,28 @@ async function explain(): Promise<string> {
   }
 }
 
+/** Tells the page a small picture of a scan; null where none can be had now. */
 async function thumbnail(scan: string): Promise<void> {
   try {
-    const [info, coarse] = await Promise.all([fetch(`${origin}/v1/scans/${scan}`), fetch(`${origin}/v1/scans/${scan}/coarse`)]);
-    if (!info.ok || !coarse.ok) return;
-    const model = new Model((await info.json()) as ScanInfo, 0);
-    const body = await coarse.arrayBuffer();
-    for (let at = 0; at < body.byteLength; ) {
-      const size = new DataView(body).getUint32(at, true);
-      await model.apply(parseRefinement(new Uint8Array(body, at + 4, size)), codecs);
-      at += 4 + size;
-    }
-    const pixels = drawThumbnail(model.info, model.coarseSteps, model.coarseTexels, FACING_RAD);
-    scope.postMessage({ kind: 'thumbnail', scan, side: THUMBNAIL_SIDE, pixels }, [pixels.buffer]);
+    tell({ kind: 'thumbnail', scan, picture: await pictured(scan) });
   } catch (error) {
     console.warn(`no thumbnail of ${scan}`, error);
+    tell({ kind: 'thumbnail', scan, picture: null });
   }
+}
+
+async function pictured(scan: string): Promise<Blob | null> {
+  const [info, coarse] = await Promise.all([fetch(`${origin}/v1/scans/${scan}`), fetch(`${origin}/v1/scans/${scan}/coarse`)]);
+  if (!info.ok || !coarse.ok) return null;
+  const model = new Model((await info.json()) as ScanInfo, 0);
+  const body = await coarse.arrayBuffer();
+  for (let at = 0; at < body.byteLength; ) {
+    const size = new DataView(body).getUint32(at, true);
+    await model.apply(parseRefinement(new Uint8Array(body, at + 4, size)), codecs);
+    at += 4 + size;
+  }
+  const canvas = new OffscreenCanvas(THUMBNAIL_SIDE, THUMBNAIL_SIDE);
+  const pixels = drawThumbnail(model.info, model.coarseSteps, model.coarseTexels, FACING_RAD);
+  canvas.getContext('2d', { willReadFrequently: true })!.putImageData(new ImageData(pixels, THUMBNAIL_SIDE), 0, 0);
+  return canvas.convertToBlob();
 }

@@ -2,14 +2,14 @@ import type { ScanSummary, Sidecar } from '../api.ts';
 import { strings } from '../strings.ts';
 import { h, refill, section } from './dom.ts';
 
-type Picture = { side: number; pixels: Uint8ClampedArray<ArrayBuffer> };
-
 /** The scans of the node, newest first, each with a small picture. */
 export class ScanList {
   readonly element: HTMLElement;
   private readonly list = h('ul', { class: 'scans' });
-  private readonly pictures = new Map<string, Picture>();
-  private readonly canvases = new Map<string, HTMLCanvasElement>();
+  /** Of scans that have been in view: where their picture is, '' until it comes. */
+  private readonly pictures = new Map<string, string>();
+  private readonly images = new Map<string, HTMLImageElement>();
+  private readonly inView = new IntersectionObserver((entries) => this.seen(entries));
   private scans: ScanSummary[] = [];
   private current: string | null = null;
 
@@ -19,7 +19,6 @@ export class ScanList {
 
   show(scans: ScanSummary[]): void {
     this.scans = scans;
-    for (const { id } of scans) if (!this.pictures.has(id)) this.wantPicture(id);
     this.fill();
   }
 
@@ -34,24 +33,37 @@ export class ScanList {
     this.fill();
   }
 
-  picture(id: string, picture: Picture): void {
-    this.pictures.set(id, picture);
-    const canvas = this.canvases.get(id);
-    if (canvas) paint(canvas, picture);
+  /** A picture has come; null: ask again when the list is next filled. */
+  picture(id: string, picture: Blob | null): void {
+    if (!picture) {
+      this.pictures.delete(id);
+      return;
+    }
+    const address = URL.createObjectURL(picture);
+    this.pictures.set(id, address);
+    this.images.get(id)?.setAttribute('src', address);
+  }
+
+  private seen(entries: IntersectionObserverEntry[]): void {
+    for (const { target, isIntersecting } of entries) {
+      const id = (target as HTMLElement).dataset['scan']!;
+      if (!isIntersecting || this.pictures.has(id)) continue;
+      this.pictures.set(id, '');
+      this.wantPicture(id);
+    }
   }
 
   private fill(): void {
-    this.canvases.clear();
+    this.images.clear();
+    this.inView.disconnect();
     const focused = (document.activeElement as HTMLElement | null)?.dataset['scan'];
     refill(this.list, ...(this.scans.length ? this.scans.map((scan) => this.item(scan)) : [h('li', {}, strings.scans.none)]));
     if (focused) this.list.querySelector<HTMLElement>(`[data-scan="${focused}"]`)?.focus();
   }
 
   private item(scan: ScanSummary): HTMLLIElement {
-    const canvas = h('canvas', { width: 96, height: 96, 'aria-hidden': 'true' });
-    this.canvases.set(scan.id, canvas);
-    const picture = this.pictures.get(scan.id);
-    if (picture) paint(canvas, picture);
+    const image = h('img', { alt: '', src: this.pictures.get(scan.id) || null });
+    this.images.set(scan.id, image);
     const site = strings.scans.site(scan.subject ?? '', scan.bodySite ?? '');
     const text = h('span', {},
       h('strong', {}, scan.name || strings.scans.untitled),
@@ -60,13 +72,10 @@ export class ScanList {
     );
     const current = scan.id === this.current;
     const attributes = { type: 'button', 'data-scan': scan.id, 'aria-current': current ? 'true' : null, click: () => this.open(scan.id) };
-    return h('li', {}, h('button', attributes, canvas, text));
+    const button = h('button', attributes, image, text);
+    this.inView.observe(button);
+    return h('li', {}, button);
   }
-}
-
-/** By the processor: a small picture is not worth a context on the graphics card. */
-function paint(canvas: HTMLCanvasElement, { side, pixels }: Picture): void {
-  canvas.getContext('2d', { willReadFrequently: true })!.putImageData(new ImageData(pixels, side, side), 0, 0);
 }
 
 function when(unixS: number): string {
