@@ -1,5 +1,6 @@
 // Waiting for the graphics card without keeping the page's thread.
 
+import { Mesh } from 'three';
 import type { Camera, Object3D, WebGLRenderer } from 'three';
 
 const LOOK_MS = 4;
@@ -15,9 +16,19 @@ export async function cardIsDone(renderer: WebGLRenderer): Promise<void> {
   gl.deleteSync(fence);
 }
 
-/** Compile what an object is drawn with, for the render target that is set. */
+/**
+ * Compile what an object is drawn with, for the render target that is set, and ask for what the programs want to be told:
+ * three.js would ask at the first picture, and wait for all that the card was given until then.
+ */
 export async function compile(renderer: WebGLRenderer, object: Object3D, camera: Camera): Promise<void> {
   if (renderer.extensions.has('KHR_parallel_shader_compile')) await renderer.compileAsync(object, camera);
   else renderer.compile(object, camera);
   await cardIsDone(renderer);
+  object.traverse((each) => {
+    if (each instanceof Mesh) (renderer.properties.get(each.material) as Compiled).currentProgram.getUniforms();
+  });
+}
+
+interface Compiled {
+  currentProgram: { getUniforms(): unknown };
 }

@@ -9,6 +9,9 @@ export interface Place {
   v: number;
 }
 
+export type Geometry = NonNullable<ScanInfo['geometry']>;
+
+export const geometryOf = ({ geometry }: ScanInfo): Geometry => geometry ?? 'cylinder';
 export const isSphere = ({ geometry }: ScanInfo): boolean => geometry === 'sphere';
 
 /** The point that is radiusMm from the axis, or from the centre, at a place. */

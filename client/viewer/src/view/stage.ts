@@ -9,8 +9,8 @@ import { FACING_RAD } from '../facing.ts';
 import { cardIsDone } from './compile.ts';
 import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
 import { locate, pick } from './pick.ts';
-import { isSphere } from './room.ts';
-import type { Place } from './room.ts';
+import { geometryOf, isSphere } from './room.ts';
+import type { Geometry, Place } from './room.ts';
 import { Surface } from './surface.ts';
 import type { Shading } from './surface.ts';
 import type { Detail } from './tiles.ts';
@@ -54,12 +54,14 @@ export class Stage {
   private readonly camera = new PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 1, 1000);
   private readonly controls: OrbitControls;
   private surface: Surface | null = null;
-  /** Replaced by the one above; kept until that is drawn, because they share compiled programs. */
-  private readonly retired: Surface[] = [];
+  /**
+   * The smallest surface of each kind, once its programs are compiled; while it is kept, so are they. Until then nothing
+   * of that kind can be drawn without waiting for them.
+   */
+  private readonly smallest = new Map<Geometry, Surface>();
+  private readonly warming = new Set<Geometry>();
   private shading: Shading = 'lit';
   private overlay: Channel | null = null;
-  /** Until programs are compiled, nothing can be drawn without waiting for them. */
-  private isWarm = false;
   private asked = false;
   private moving = false;
   private pace = 1;
@@ -85,11 +87,17 @@ export class Stage {
     canvas.addEventListener('webglcontextlost', (event) => {
       event.preventDefault();
       this.clear(); // now, while deleting what is gone does nothing
+      for (const each of this.smallest.values()) each.dispose();
+      this.smallest.clear();
+      this.warming.clear();
       this.events.lost();
     });
-    canvas.addEventListener('webglcontextrestored', () => this.events.restored());
+    canvas.addEventListener('webglcontextrestored', () => {
+      void this.warm('cylinder');
+      this.events.restored();
+    });
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement!);
-    void this.warm();
+    void this.warm('cylinder');
   }
 
   /** Show a scan. framed: with the camera where it sees everything; else it stays. */
@@ -100,8 +108,9 @@ export class Stage {
     this.scene.add(this.surface.object);
     if (old) {
       this.scene.remove(old.object);
-      this.retired.push(old);
+      old.dispose();
     }
+    void this.warm(geometryOf(snapshot.info));
     if (framed) this.frame();
     this.draw();
   }
@@ -246,16 +255,24 @@ export class Stage {
     this.surface?.makeReady();
   }
 
-  /** Draw the smallest of surfaces, so that programs are there, and the card knows them, before a scan is. */
-  private async warm(): Promise<void> {
-    const first = this.surfaceOf(nothing());
-    await first.compile(this.camera);
-    first.prepare(this.camera, 1, this.detail);
-    this.renderer.render(first.object, this.camera);
-    first.makeReady();
-    this.retired.push(first);
-    this.isWarm = true;
+  /** Draw the smallest surface of a kind, so that programs are there, and the card knows them, before a scan is. */
+  private async warm(geometry: Geometry): Promise<void> {
+    if (this.warming.has(geometry)) return;
+    this.warming.add(geometry);
+    const smallest = this.surfaceOf(nothing(geometry));
+    await smallest.compile(this.camera);
+    if (!this.warming.has(geometry)) return; // the card was lost meanwhile
+    this.smallest.set(geometry, smallest);
+    if (!this.surface) {
+      smallest.prepare(this.camera, 1, this.detail);
+      this.renderer.render(smallest.object, this.camera);
+      smallest.makeReady();
+    }
     this.draw();
+  }
+
+  private get isWarm(): boolean {
+    return this.smallest.has(this.surface ? geometryOf(this.surface.info) : 'cylinder');
   }
 
   private surfaceOf({ info, ...state }: Snapshot): Surface {
@@ -271,6 +288,7 @@ export class Stage {
 
   private paint(nowMs: number): void {
     this.asked = false;
+    if (!this.isWarm) return;
     if (this.controls.enableDamping) this.controls.update();
     this.keepPace(nowMs);
     this.isHasty = this.moving && this.pace > 1;
@@ -285,7 +303,6 @@ export class Stage {
     this.renderer.render(this.scene, this.camera);
     clearTimeout(this.leisure);
     this.leisure = setTimeout(() => void this.useLeisure(), LEISURE_MS);
-    for (const old of this.retired.splice(0)) old.dispose();
     const { dataset } = this.canvas;
     dataset['drawn'] = String(Number(dataset['drawn'] ?? 0) + 1);
     dataset['triangles'] = String(triangles);
@@ -344,9 +361,9 @@ function drawsInSoftware(context: WebGL2RenderingContext): boolean {
 }
 
 /** The smallest scan, as coarse as a first view. */
-function nothing(): Snapshot {
+function nothing(geometry: Geometry): Snapshot {
   const info = {
-    id: '', width: 8, height: 8, textureWidth: 16, textureHeight: 16, coarseWidth: 1, coarseHeight: 1, coarseTextureWidth: 1,
+    id: '', geometry, width: 8, height: 8, textureWidth: 16, textureHeight: 16, coarseWidth: 1, coarseHeight: 1, coarseTextureWidth: 1,
     coarseTextureHeight: 1, stepMm: 1, pitchMm: 1, zMaxMm: 4, theta0Rad: 0,
   };
   return { info, steps: new Uint16Array(64).fill(1), coarseTexels: new Uint8Array(4), levels: [new Uint8Array(1).fill(6), new Uint8Array(1).fill(6)] };
