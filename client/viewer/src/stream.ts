@@ -17,6 +17,7 @@ import type { Refinement } from './protocol/refinement.ts';
 const CLIENT = 'foveascan viewer';
 const VIOLATION = 4002;
 const PICTURE_MS = 100;
+const TOGETHER_MS = 30;
 
 interface Looking {
   look: Look;
@@ -43,6 +44,7 @@ export class Stream {
   /** Messages that have come and are not taken yet, and patches that the page shall get with what they bring. */
   private waiting = 0;
   private patches: Extract<FromWorker, { kind: 'patch' }>[] = [];
+  private patchTimer: ReturnType<typeof setTimeout> | undefined;
   private request = 0;
   private opening = 0;
   private looking: Looking | null = null;
@@ -197,12 +199,19 @@ export class Stream {
     this.patches.push({ kind: 'patch', channel, changed, level });
   }
 
-  /** A message is done with. What belongs together and has come together is drawn at once, not one after the other. */
+  /**
+   * A message is done with. What belongs together and comes together is drawn at once, not one after the other: range
+   * waits a moment for its texture, or for the end of the update.
+   */
   private taken(): void {
-    if (--this.waiting === 0) this.tellPatches();
+    if (--this.waiting > 0 || !this.patches.length) return;
+    if (this.patches.some(({ channel }) => channel === TEXTURE)) this.tellPatches();
+    else this.patchTimer ??= setTimeout(() => this.tellPatches(), TOGETHER_MS);
   }
 
   private tellPatches(): void {
+    clearTimeout(this.patchTimer);
+    this.patchTimer = undefined;
     for (const patch of this.patches.splice(0)) this.tell(patch, patch.changed.map(({ cells }) => cells.buffer as ArrayBuffer));
   }
 

@@ -250,6 +250,7 @@ export class Stage {
     return { x, y, hidden: outside || this.hides(point) };
   }
 
+  /** Do what the first picture could do without, so that the first look need not wait for it. */
   private async useLeisure(): Promise<void> {
     await cardIsDone(this.renderer);
     this.surface?.makeReady();
@@ -266,7 +267,6 @@ export class Stage {
     if (!this.surface) {
       smallest.prepare(this.camera, 1, this.detail);
       this.renderer.render(smallest.object, this.camera);
-      smallest.makeReady();
     }
     this.draw();
   }

@@ -38,6 +38,7 @@ export class Surface {
   private readonly coarse: DataTexture;
   private dense: DataTexture;
   private readonly normals: Normals;
+  private isReady = false;
   private readonly uniforms: Uniforms;
 
   constructor(
@@ -82,7 +83,11 @@ export class Surface {
 
   /** Do what the first picture could do without, so that the first look need not wait for it. */
   makeReady(): void {
+    if (this.isReady) return;
+    this.isReady = true;
     this.normals.fill();
+    // three.js asks the card about uploads once, and waits for the answer.
+    this.upload(integers(this.steps.slice(0, 1), 1, 1, 'R16UI'), this.range, 0, 0);
   }
 
   /** Take rectangles that have changed, and the levels then held. */
