@@ -83,7 +83,7 @@ test('a sphere is closed over its poles by a fan for each tile beside them', () 
   const camera = new PerspectiveCamera(120, 1, 1, 1000);
   camera.position.set(0, SPHERE.zMaxMm, 120);
   camera.updateMatrixWorld();
-  const { batches } = tiles.choose(camera, 700, { cellPx: 1, trianglesMax: 1e6, tileSide: TILE });
+  const { batches } = tiles.choose(camera, 700, { cellPx: 1, awayFactor: 1, trianglesMax: 1e6, tileSide: TILE });
   const fans = batches.flatMap(({ fans }) => fans.filter((_, at) => at % 2 === 0).map((column, at) => `${column} ${fans[2 * at + 1]}`));
   const columns = Array.from({ length: Math.ceil(INFO.width / TILE) }, (_, at) => at * TILE);
   assert.deepEqual(fans.sort(), columns.flatMap((column) => [`${column} 0`, `${column} 1`]).sort());
@@ -109,6 +109,27 @@ test('everything fits the picture, however narrow', () => {
   assert.ok(fittingDistance(bounds, 0.4) > fittingDistance(bounds, 2));
 });
 
+test('what is turned away is drawn with fewer triangles, and what is not with as many', () => {
+  const tiles = new Tiles(INFO, TILE);
+  tiles.update(alike(50), new Uint8Array(45 * 25));
+  const camera = new PerspectiveCamera(28, 1, 1, 1000);
+  camera.position.set(-500, 0, 0);
+  camera.lookAt(0, 0, 0);
+  camera.updateMatrixWorld();
+  const strides = (awayFactor: number): Map<string, number> => {
+    const { batches } = tiles.choose(camera, 700, { tileSide: TILE, cellPx: 4, awayFactor, trianglesMax: 1e6 });
+    return new Map(batches.flatMap(({ corners }, index) => Array.from({ length: corners.length / 2 }, (_, k) => [`${corners[2 * k]},${corners[2 * k + 1]}`, STRIDES[index]!])));
+  };
+  const [all, fewer] = [strides(1), strides(4)];
+  assert.deepEqual([...all.keys()].sort(), [...fewer.keys()].sort());
+  for (const [tile, stride] of all) {
+    const column = Number(tile.split(',')[0]) + TILE / 2;
+    const towards = -Math.cos(INFO.theta0Rad + (2 * Math.PI * column) / INFO.width); // the camera is at -x
+    if (towards > 0.2) assert.equal(fewer.get(tile), stride);
+    if (towards < -0.6) assert.equal(fewer.get(tile), 4 * stride);
+  }
+});
+
 test('neighbouring tiles share every vertex of their border', () => {
   const tiles = new Tiles(INFO, TILE);
   tiles.update(alike(50), new Uint8Array(45 * 25).map((_, block) => (block % 45 < 24 ? 0 : 6)));
@@ -116,7 +137,7 @@ test('neighbouring tiles share every vertex of their border', () => {
   camera.position.set(-500, 0, 0);
   camera.lookAt(0, 0, 0);
   camera.updateMatrixWorld();
-  const { batches } = tiles.choose(camera, 700, { tileSide: TILE, cellPx: 1, trianglesMax: 1e6 });
+  const { batches } = tiles.choose(camera, 700, { tileSide: TILE, cellPx: 1, awayFactor: 4, trianglesMax: 1e6 });
   assert.ok(batches.filter(({ corners }) => corners.length).length > 1, 'several strides are drawn');
   const drawn = new Map<string, { stride: number; right: number; left: number }>();
   batches.forEach(({ corners, edges }, index) => {

@@ -120,7 +120,7 @@ def test_what_moves_by_itself_stands_still_where_that_is_asked_for(browser: Brow
                 settled_camera(page)
                 assert drawn(page) - before <= 1, "the picture glides on"
             else:
-                page.wait_for_function("(least) => Number(document.querySelector('#view').dataset.drawn) > least", arg=before + 1)
+                page.wait_for_function(f"() => Number(document.querySelector('#view').dataset.drawn) > {before + 1}")
 
 
 def test_what_a_sweep_is_worth_is_said(browser: Browser, node: RunningNode) -> None:
@@ -135,7 +135,7 @@ def test_what_a_sweep_is_worth_is_said(browser: Browser, node: RunningNode) -> N
 
 
 def dragged(page: Page) -> int:
-    """Turn the picture a little and let go. Returns how many pictures were drawn by then; one of the camera at rest follows."""
+    """Turn the picture a little and let go. Returns how many were drawn by then; one at rest may follow."""
     box = page.locator("#view").bounding_box()
     assert box is not None
     page.mouse.move(box["x"] + 200, box["y"] + 200)

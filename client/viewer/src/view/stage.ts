@@ -15,9 +15,9 @@ import { Surface } from './surface.ts';
 import type { Shading } from './surface.ts';
 import type { Detail } from './tiles.ts';
 
-const HARDWARE: Detail = { tileSide: 64, cellPx: 2, trianglesMax: 3e6 };
+const HARDWARE: Detail = { tileSide: 64, cellPx: 2, awayFactor: 1, trianglesMax: 3e6 };
 /** Fewer, larger tiles: a processor spends more on each one than on its triangles. */
-const SOFTWARE: Detail = { tileSide: 128, cellPx: 7, trianglesMax: 1.5e5 };
+const SOFTWARE: Detail = { tileSide: 128, cellPx: 7, awayFactor: 4, trianglesMax: 1.5e5 };
 /** Drawn larger than shown, so that edges are smooth. */
 const SMOOTH_RATIO = 1.5;
 const SLOW_FRAME_MS = 40;

@@ -3,15 +3,21 @@
 import type { PerspectiveCamera } from 'three';
 import { Frustum, Matrix4, Sphere, Vector3 } from 'three';
 import type { ScanInfo } from '../protocol/messages.ts';
-import { isSphere, pointAt } from './room.ts';
+import { isSphere, pointAt, stepsAt } from './room.ts';
 
 export const STRIDES = [1, 2, 4, 8, 16, 32] as const;
 const BLOCK = 8;
+/** Sine of the angle beyond which a tile counts as turned away. */
+const AWAY = 0.35;
 
-/** How fine to draw: side of a tile [samples], side of a drawn cell on the screen, and most triangles of a frame. */
+/**
+ * How fine to draw: side of a tile [samples], side of a drawn cell on the screen, how much larger it is on what is turned
+ * away and shows only through holes, and most triangles of a frame.
+ */
 export interface Detail {
   tileSide: number;
   cellPx: number;
+  awayFactor: number;
   trianglesMax: number;
 }
 
@@ -20,6 +26,8 @@ interface Tile {
   row: number;
   centre: Vector3;
   reachMm: number;
+  /** Out of the surface, in the mean. */
+  outward: Vector3;
   /** Finest stride that shows more than the samples held. */
   finest: number;
 }
@@ -46,7 +54,7 @@ export class Tiles {
     this.stride = new Int32Array(this.across * this.down);
     for (let row = 0; row < this.down; row++) {
       for (let column = 0; column < this.across; column++) {
-        this.tiles.push({ column: column * this.side, row: row * this.side, centre: new Vector3(), reachMm: 0, finest: 1 });
+        this.tiles.push({ column: column * this.side, row: row * this.side, centre: new Vector3(), reachMm: 0, outward: new Vector3(), finest: 1 });
       }
     }
   }
@@ -74,8 +82,19 @@ export class Tiles {
       const rowMm = sphere ? (radius * Math.PI) / height : pitchMm;
       const half = [(radius * Math.PI * columns) / width, (rows * rowMm) / 2, most ? ((most - least) * stepMm) / 2 : 0];
       tile.reachMm = most ? 1.3 * Math.hypot(...half) : 0;
+      tile.outward.copy(this.outward(steps, tile, columns, rows, radius));
       tile.finest = this.finest(tile, columns, rows, level);
     }
+  }
+
+  /** From the middles of its sides; one that is void is as far out as the tile is in the mean. */
+  private outward(steps: Uint16Array, { column, row }: Tile, columns: number, rows: number, radiusMm: number): Vector3 {
+    const { width, height, stepMm } = this.info;
+    const at = (x: number, y: number): Vector3 => {
+      const own = stepsAt(this.info, steps, column + Math.floor(x * (columns - 1)), row + Math.floor(y * (rows - 1)));
+      return pointAt(this.info, { u: (column + x * columns) / width, v: (row + y * rows) / height }, own * stepMm || radiusMm);
+    };
+    return at(0.5, 1).sub(at(0.5, 0)).cross(at(1, 0.5).sub(at(0, 0.5))).normalize();
   }
 
   /** Batches by stride index, and the triangles in them. sidePx: height of the picture. */
@@ -83,19 +102,20 @@ export class Tiles {
     this.frustum.setFromProjectionMatrix(new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
     const focalPx = sidePx / (2 * Math.tan((camera.fov * Math.PI) / 360));
     for (let cellPx = detail.cellPx; ; cellPx *= 1.5) {
-      const triangles = this.pick(camera, focalPx, cellPx);
+      const triangles = this.pick(camera, focalPx, cellPx, detail.awayFactor);
       if (triangles <= detail.trianglesMax || cellPx > 64 * detail.cellPx) return { batches: this.batches(), triangles };
     }
   }
 
-  private pick(camera: PerspectiveCamera, focalPx: number, cellPx: number): number {
+  private pick(camera: PerspectiveCamera, focalPx: number, cellPx: number, awayFactor: number): number {
     let triangles = 0;
-    const ball = new Sphere();
+    const [ball, sight] = [new Sphere(), new Vector3()];
     this.tiles.forEach((tile, index) => {
       const seen = tile.reachMm > 0 && this.frustum.intersectsSphere(ball.set(tile.centre, tile.reachMm));
       const distance = Math.max(camera.position.distanceTo(tile.centre) - tile.reachMm, camera.near);
       const samplePx = (this.info.pitchMm * focalPx) / distance;
-      const wanted = Math.max(cellPx / samplePx, tile.finest);
+      const isAway = sight.subVectors(tile.centre, camera.position).normalize().dot(tile.outward) > AWAY;
+      const wanted = Math.max((cellPx / samplePx) * (isAway ? awayFactor : 1), tile.finest);
       const stride = Math.min(2 ** Math.max(0, Math.floor(Math.log2(wanted))), STRIDES.at(-1)!);
       this.stride[index] = seen ? stride : 0;
       triangles += seen ? 2 * (this.side / stride) ** 2 : 0;
