@@ -76,10 +76,11 @@ def examine_link(
         ("a start before it is configured", bare.check_early_start, False),
         ("frames of another session", bare.check_other_session, False),
         ("another major version", bare.check_other_major, False),
+        ("channels of one turn", bare.check_channels, True),
         ("credit", bare.check_credit, False),
-        ("a sweep", lambda: _check_sweep(port, config, clock), False),
-        ("columns sent again", lambda: _check_again(port, config, clock), False),
-        ("stopping", lambda: _check_stop(port, config, clock), False),
+        ("a sweep", lambda: _check_sweeps(port, config, clock, bare.requests), False),
+        ("columns sent again", lambda: _check_again(port, config, clock, bare.requests[0]), False),
+        ("stopping", lambda: _check_stop(port, config, clock, bare.requests[0]), False),
     )
     for name, check, is_needed in checks:
         try:
@@ -101,6 +102,7 @@ class _Bare:
         self._session = 0
         self._seq = 0
         self._hello_frame = b""
+        self.requests: tuple[SweepRequest, ...] = ()  # that make up a whole sweep, as far as the device takes them
 
     def check_greeting(self) -> str:
         """HELLO is answered by HELLO_ACK that makes sense."""
@@ -170,11 +172,36 @@ class _Bare:
             raise _Problem("no answer to a HELLO of another major version", "Versions: NAK code 1, in your own version")
         return "refused"
 
+    def check_channels(self) -> str:
+        """One turn takes range and texture, or each is taken alone."""
+        apart = tuple(SweepRequest(channel) for channel in (Channel.RANGE, Channel.TEXTURE))
+        takes_both = self._takes(SweepRequest())
+        takes_apart = [self._takes(request) for request in apart]
+        if not takes_both and not all(takes_apart):
+            cure = "CONFIG: accept channels 3, or both 1 and 2; NAK code 5 refuses what it cannot do"
+            raise _Problem("no turns that it takes give range and texture", cure)
+        self.requests = (SweepRequest(),) * takes_both + apart * all(takes_apart)
+        return ", ".join(["range and texture at once"] * takes_both + ["each in a turn of its own"] * all(takes_apart))
+
+    def _takes(self, request: SweepRequest) -> bool:
+        """Whether it accepts a configuration; it may refuse it with code 5 only."""
+        self._port.write(self._frame(SweepRequest.TYPE, encode_message(request), Flag.ANSWER_WANTED))
+        message = self._decoded(self._answered("CONFIG"))
+        if isinstance(message, Nak) and message.code is not NakCode.UNSUPPORTED:
+            raise _Problem(f"CONFIG was refused: {message.code.name.lower()}: {message.text}", "Messages: NAK codes")
+        return isinstance(message, Ack)
+
+    def _answered(self, to: str) -> Frame:
+        frame = self._next(lambda frame: frame.type in (Ack.TYPE, Nak.TYPE), _ANSWER_S)
+        if frame is None:
+            raise _Problem(f"no answer to {to} within {_ANSWER_S:g} s", "Commands and retries")
+        return frame
+
     def check_credit(self) -> str:
         """With a window of a few frames it stops there, and says so."""
         window = 4 * (FRAME_OVERHEAD + self._config.payload_max)
         self._greet(window)
-        for command in (Reset(), SweepRequest(), SweepStart(1)):
+        for command in (Reset(), self.requests[0], SweepStart(1)):
             self._port.write(self._frame(command.TYPE, encode_message(command), Flag.ANSWER_WANTED))
             self._acked(type(command).__name__, "States of a scanner")
         header = self._next(lambda frame: frame.type == SweepHeader.TYPE, _ANSWER_S)
@@ -269,11 +296,19 @@ class _Bare:
             raise _Problem(f"message type {frame.type:#04x} does not follow its table: {error}", "Messages") from error
 
 
-def _check_sweep(port: Port, config: ScannerConfig, clock: Callable[[], float]) -> str:
-    """A whole sweep with the node's own driver."""
+def _check_sweeps(
+    port: Port, config: ScannerConfig, clock: Callable[[], float], requests: tuple[SweepRequest, ...]
+) -> str:
+    """A whole sweep with the node's own driver, for every kind of turn that the device takes."""
     scanner = Scanner(port, config, clock)
     scanner.hello()
-    for event in scanner.sweep(SweepRequest()):
+    return "; ".join(_check_sweep(scanner, request) for request in requests)
+
+
+def _check_sweep(scanner: Scanner, request: SweepRequest) -> str:
+    for event in scanner.sweep(request):
+        if isinstance(event, SweepStarted) and event.header.channels is not request.channels:
+            raise _Problem("its SWEEP_HEADER has other channels than CONFIG", "SWEEP_HEADER: channels as in CONFIG")
         if isinstance(event, SweepInterrupted):
             raise _Problem(f"interrupted: {event.reason}", "Missing columns; SWEEP_END's pieces and digest")
         if isinstance(event, SweepFinished):
@@ -284,13 +319,13 @@ def _check_sweep(port: Port, config: ScannerConfig, clock: Callable[[], float]) 
     return f"{rate}, digest agrees"
 
 
-def _check_again(port: Port, config: ScannerConfig, clock: Callable[[], float]) -> str:
+def _check_again(port: Port, config: ScannerConfig, clock: Callable[[], float], request: SweepRequest) -> str:
     """The first column, asked for after the sweep, comes byte for byte as before."""
     scanner = Scanner(port, config, clock)
     scanner.hello()
     before: dict[int, bytes] = {}
     held, header = [], None
-    for event in scanner.sweep(SweepRequest()):
+    for event in scanner.sweep(request):
         if isinstance(event, SweepStarted):
             header = event.header
         elif isinstance(event, RangeColumn | TextureColumn):
@@ -308,12 +343,12 @@ def _check_again(port: Port, config: ScannerConfig, clock: Callable[[], float]) 
     return f"{len(before)} pieces, byte for byte"
 
 
-def _check_stop(port: Port, config: ScannerConfig, clock: Callable[[], float]) -> str:
+def _check_stop(port: Port, config: ScannerConfig, clock: Callable[[], float], request: SweepRequest) -> str:
     """A sweep that is stopped ends, and another one can begin."""
     scanner, stop = Scanner(port, config, clock), threading.Event()
     scanner.hello()
     last = None
-    for event in scanner.sweep(SweepRequest(), stop):
+    for event in scanner.sweep(request, stop):
         last = event
         stop.set()
     if not isinstance(last, SweepInterrupted | SweepFinished):

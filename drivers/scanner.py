@@ -27,7 +27,7 @@ from drivers.sweep import (
     SweepReport,
     SweepStarted,
 )
-from protocol.errors import LocalWireError, PortLost, ScannerFault
+from protocol.errors import LocalWireError, PortLost, ScannerFault, Unsupported
 from protocol.scanner_link import (
     Accepted,
     Command,
@@ -47,6 +47,7 @@ from protocol.scanner_messages import (
     Column,
     DeviceInfo,
     Fault,
+    NakCode,
     Order,
     RangeColumn,
     Reset,
@@ -111,17 +112,24 @@ class Scanner:
             if isinstance(report, Calibration):
                 return report
 
-    def sweep(self, request: SweepRequest, stop: threading.Event | None = None) -> Generator[SweepEvent, None, None]:
-        """One sweep, event by event; whatever the scanner was doing is dropped first. Setting `stop` ends it.
+    def configure(self, request: SweepRequest) -> None:
+        """Tell the scanner how the next sweep shall be; whatever it was doing is dropped.
 
-        After a sweep that broke, the scanner is greeted first: it may have started anew and know us no longer.
-        Raises PortLost or ScannerFault when it does not even start.
+        After a sweep that broke, it is greeted first: it may have started anew and know us no longer.
+        Raises PortLost or ScannerFault, which is Unsupported when it cannot sweep so.
         """
         if self._is_doubtful:
             self.hello()
-        self._sweep = self._sweep % 65535 + 1
         for command in (Reset(), request):
             self._command(command)
+
+    def sweep(self, request: SweepRequest, stop: threading.Event | None = None) -> Generator[SweepEvent, None, None]:
+        """One sweep, event by event; whatever the scanner was doing is dropped first. Setting `stop` ends it.
+
+        Raises PortLost or ScannerFault when it does not even start, Unsupported when it cannot sweep so.
+        """
+        self.configure(request)
+        self._sweep = self._sweep % 65535 + 1
         header = self._start()
         yield SweepStarted(header)
         yield from self._collect(self._collector(header), stop or threading.Event())
@@ -254,7 +262,8 @@ class Scanner:
         name = self._port.name
         match event:
             case Refused(message, code, text):
-                raise ScannerFault(f"{name}: {type(message).__name__} refused, {code.name.lower()}: {text}")
+                fault = Unsupported if code is NakCode.UNSUPPORTED else ScannerFault
+                raise fault(f"{name}: {type(message).__name__} refused, {code.name.lower()}: {text}")
             case Unanswered(message):
                 raise ScannerFault(f"{name}: no answer to {type(message).__name__}; is a scanner connected and on?")
             case WrongVersion(major):

@@ -36,7 +36,8 @@ WEIGHT_ONE = np.uint32(1 << WEIGHT_BITS)
 TOLERANCE_ROWS = 0.25  # ranges that differ by less than this part of a row's height are no outliers
 TOLERANCE_GREY = 24.0
 SIGMA_COLUMNS = 256  # are enough to tell the noise
-SLIP_COLUMNS = 512  # are enough to tell a slip
+SLIP_COLUMNS = 512  # are enough to tell a slip, of an eighth of a turn at most
+SLIP_COLUMNS_MIN = 16
 SLIP_REACH_MIN = 8
 PROFILE_ROWS = 256
 
@@ -129,17 +130,6 @@ class Assembler:
         """Take rows row0... of the texture column at an encoder count, as for range. samples : (n, 3) uint8 RGB."""
         self._texture.add(self._encoder.tick(encoder_count), row0, samples)
 
-    def with_texture_of(self, other: Assembler) -> Assembler:
-        """The range columns of this sweep and the texture columns of another one, put together by the encoder.
-
-        Raises ValueError when the two do not describe the same grid on the same table.
-        """
-        if other._spec != self._spec or other._encoder.counts_per_turn != self._encoder.counts_per_turn:
-            raise ValueError("a texture-only sweep goes with a range-only sweep of the same grid and table")
-        both = Assembler(self._spec, self._encoder)
-        both._range, both._texture = self._range, other._texture
-        return both
-
     def missing_range(self) -> IntArray:
         """Range columns of the grid that nothing complete stands at or close enough round. (n,) ascending."""
         return self._range.folded(self._encoder.counts_per_turn).missing
@@ -152,12 +142,13 @@ class Assembler:
         """The sweep as a grid of equal angles, averaged where it was seen more than once. Raises IncompleteTurn."""
         return self._average()[0]
 
-    def assembly(self, *, repairs: bool = True) -> Assembly:
+    def assembly(self, *, repairs: bool = True, apart: bool = False) -> Assembly:
         """The grid, and what there is to say about it. Raises IncompleteTurn.
 
         repairs : take spikes out and fill small holes; without, every sample is one that was measured.
+        apart : range and texture were not seen at the same time.
         """
-        grid, quality = self._average()
+        grid, quality = self._average(apart)
         repaired = repair(grid, quality.noise_mm or 0.0) if repairs else Repaired(grid, 0, 0)
         found = survey(repaired.grid)
         said = replace(
@@ -171,14 +162,14 @@ class Assembler:
         )
         return Assembly(repaired.grid, said)
 
-    def _average(self) -> tuple[Grid, ScanQuality]:
+    def _average(self, apart: bool = False) -> tuple[Grid, ScanQuality]:
         counts = self._encoder.counts_per_turn
         missing = self.missing_range(), self.missing_texture()
         if missing[0].size or missing[1].size:
             raise IncompleteTurn(*missing)
         s = self._spec
         range_laps, texture_laps = self._range.laps(counts), self._texture.laps(counts)
-        slips = self._slips_deg(range_laps, texture_laps)
+        slips = self._slips_deg(range_laps, texture_laps, apart)
         moved = {lap for lap, (_, matters) in slips.items() if matters}
         range_steps = np.empty((s.height, s.width), np.uint16)
         texture = np.empty((s.texture_height, s.texture_width, 3), np.uint8)
@@ -199,14 +190,20 @@ class Assembler:
         )
         return Grid(s, range_steps, texture), quality
 
-    def _slips_deg(self, range_laps: Laps, texture_laps: Laps) -> dict[int, tuple[float, bool]]:
-        """By how much each later lap is turned against the first, and whether that matters, as far as it shows."""
+    def _slips_deg(self, range_laps: Laps, texture_laps: Laps, apart: bool) -> dict[int, tuple[float, bool]]:
+        """By how much each later lap is turned against the first, and whether that matters, as far as it shows.
+
+        What both cameras saw at once is judged by the finer one; apart, by the one that saw it move further.
+        """
         slips: dict[int, tuple[float, bool]] = {}
         for lap in sorted(range_laps.keys() | texture_laps.keys())[1:]:
             for columns, laps in ((self._texture, texture_laps), (self._range, range_laps)):
                 slip = columns.slip(laps, lap)
-                if slip is not None:
-                    slips[lap] = slip * 360.0 / columns.width, slip_matters(slip)
+                if slip is None:
+                    continue
+                found = slip * 360.0 / columns.width, slip_matters(slip)
+                slips[lap] = max(slips.get(lap, found), found, key=lambda said: (said[1], abs(said[0])))
+                if not apart:
                     break
         return slips
 
@@ -383,14 +380,26 @@ class _Columns(Generic[Samples]):
         return None
 
     def slip(self, laps: Laps, lap: int) -> float | None:
-        """By how many columns a lap is turned against the first one, where it shows."""
+        """By how many columns a lap is turned against the first one, where it shows.
+
+        A lap's beginning tells what moved before it; what moves in the last one shows at its end.
+        """
         first = min(laps, default=lap)
         if lap == first or lap not in laps:
             return None
         one, other = self._seen({first: laps[first], lap: laps[lap]})
-        columns = np.flatnonzero(other)[:SLIP_COLUMNS]
-        before, after = (self._profile(_chosen(laps[number], columns)) for number in (first, lap))
-        return shift_between(before, after, one[columns], max(SLIP_REACH_MIN, self.width // 36))
+        columns = np.flatnonzero(other)
+        few = min(SLIP_COLUMNS, max(SLIP_COLUMNS_MIN, self.width // 8))
+        parts = [columns[:few]]
+        if lap == max(laps) and columns.size > 2 * few:
+            parts.append(columns[-few:])
+        slips = [self._shift(laps[first], laps[lap], part, one[part]) for part in parts]
+        return max((slip for slip in slips if slip is not None), key=abs, default=None)
+
+    def _shift(self, first: Resampling, lap: Resampling, columns: IntArray, valid: BoolArray) -> float | None:
+        """By how many columns these ones are further on in one lap than in the first."""
+        before, after = (self._profile(_chosen(plan, columns)) for plan in (first, lap))
+        return shift_between(before, after, valid, max(SLIP_REACH_MIN, self.width // 36))
 
     def _profile(self, plan: Resampling) -> FloatArray:
         """(n, m) columns thinned to at most 256 rows, NaN where void."""

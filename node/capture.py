@@ -10,7 +10,7 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -29,18 +29,17 @@ from drivers.scanner import (
 )
 from node.assemble import Assembly
 from node.journal import Journals
-from node.resume import cut_lately, publish, resumed
+from node.resume import cut_lately, publish, resumed, resumed_by_itself
 from node.running_sweep import RunningSweep
-from protocol.errors import DriverError, FoveascanError, LibraryError, PortLost
+from node.turns import TurnEvents, TurnStarted, swept
+from protocol.errors import DriverError, FoveascanError, LibraryError, PortLost, Unsupported
 from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepRequest, TextureColumn
 
 log = logging.getLogger(__name__)
 
 BACKOFF_S = (0.5, 8.0)
 LISTEN_S = 1.0
-ONE_TURN = SweepRequest()
 
-SweepEvents = Generator[SweepEvent, None, None]
 Phase = Literal["no scanner", "connecting", "ready", "starting", "sweeping", "stopped"]
 
 
@@ -97,6 +96,15 @@ class SweepCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class Manner:
+    """How to sweep. apart : range and texture in turns of their own.  repairs : take spikes out, fill small holes."""
+
+    request: SweepRequest = SweepRequest()
+    apart: bool = False
+    repairs: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class _Resume:
     """The order to go on with an interrupted sweep. by_itself : nobody asked, so the table must not turn anew."""
 
@@ -112,7 +120,6 @@ class Capture:
     watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
     SweepInterrupted for it, whatever the scanner said.
     sweeps : where columns are kept until their grid is delivered; without it, a cut sweep is lost.
-    request : how to sweep.  repairs : whether spikes are taken out and small holes filled.
     """
 
     def __init__(
@@ -122,21 +129,19 @@ class Capture:
         deliver: Callable[[Assembly], None],
         watch: Callable[[SweepEvent], None] = lambda event: None,
         sweeps: Journals | None = None,
-        request: SweepRequest = ONE_TURN,
-        repairs: bool = True,
+        manner: Manner = Manner(),
     ) -> None:
         self._open_port = open_port
         self._config = config
         self._deliver = deliver
         self._watch = watch
         self._sweeps = sweeps
-        self._sweep_request = request
-        self._repairs = repairs
+        self._manner = manner
         self._beat_s = time.monotonic()
         self.counts = SweepCounts()  # of the capture thread; others only look
         self._stop = threading.Event()
         self._lock = threading.Lock()  # held for a moment, to look at or exchange what follows
-        self._order: SweepRequest | _Resume | None = None
+        self._order: Manner | _Resume | None = None
         self._all_in = False  # of a sweep whose grid is being delivered: the next one may be asked for
         self._port: Port | None = None
         self._status = CaptureStatus("connecting")
@@ -153,9 +158,9 @@ class Capture:
         """When the thread last showed that it gets on. [s, time.monotonic]"""
         return self._beat_s
 
-    def sweep_like(self, request: SweepRequest) -> None:
+    def sweep_like(self, manner: Manner) -> None:
         """How to sweep from the next sweep on."""
-        self._sweep_request = request
+        self._manner = manner
 
     def start(self) -> None:
         """Begin to connect."""
@@ -167,7 +172,7 @@ class Capture:
         While the grid of the last sweep is being delivered the next one may be asked for: who hears of the new scan
         hears of it before the thread is done with it.
         """
-        return self._request(self._sweep_request)
+        return self._request(self._manner)
 
     def request_resume(self, sweep_id: str) -> bool:
         """Ask to go on with an interrupted sweep; False as for request_sweep. Raises LibraryError when unknown."""
@@ -183,7 +188,7 @@ class Capture:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def _request(self, order: SweepRequest | _Resume) -> bool:
+    def _request(self, order: Manner | _Resume) -> bool:
         with self._lock:
             if self._order is not None or (self._status.refusal and not self._all_in):
                 return False
@@ -251,7 +256,7 @@ class Capture:
                 self._port = None
             port.close()
 
-    def _take_order(self) -> SweepRequest | _Resume | None:
+    def _take_order(self) -> Manner | _Resume | None:
         with self._lock:
             order, self._order = self._order, None
             if order is not None:
@@ -263,15 +268,15 @@ class Capture:
         sweep = self._sweeps and cut_lately(self._sweeps.interrupted(), info, time.time())
         return _Resume(sweep.id, by_itself=True) if sweep else None
 
-    def _obey(self, scanner: Scanner, info: DeviceInfo, order: SweepRequest | _Resume | None) -> None:
+    def _obey(self, scanner: Scanner, info: DeviceInfo, order: Manner | _Resume | None) -> None:
         """Do what was asked. Raises DriverError."""
         try:
             match order:
-                case SweepRequest():
+                case Manner(request, apart, repairs):
                     if self._sweeps is not None:
                         self._sweeps.require_room()
-                    running = RunningSweep(self._sweeps, info, repairs=self._repairs)
-                    self._run_sweep(scanner.sweep(order, self._stop), running)
+                    running = RunningSweep(self._sweeps, info, repairs=repairs)
+                    self._run_sweep(swept(scanner, request, self._stop, apart=apart), running)
                 case _Resume():
                     self._resume(scanner, info, order)
         except LibraryError as error:
@@ -285,15 +290,15 @@ class Capture:
         held = list(self._sweeps.columns(sweep.id))
         if sweep.is_complete:
             with self._delivering():
-                publish(self._sweeps, sweep, self._deliver, self._repairs)
+                publish(self._sweeps, sweep, self._deliver, self._manner.repairs)
             return
         if order.by_itself:
-            events = scanner.resume(sweep.header, held, self._stop)
+            events = resumed_by_itself(scanner, sweep, held, self._stop)
         else:
             events = resumed(scanner, info, sweep, held, self._stop)
-        self._run_sweep(events, RunningSweep(self._sweeps, info, sweep.id, held, repairs=self._repairs))
+        self._run_sweep(events, RunningSweep(self._sweeps, info, sweep.id, held, repairs=self._manner.repairs))
 
-    def _run_sweep(self, events: SweepEvents, running: RunningSweep) -> None:
+    def _run_sweep(self, events: TurnEvents, running: RunningSweep) -> None:
         """One sweep, from its header to the grid that it makes. Raises DriverError.
 
         However it ends, its columns are a scan or an interrupted sweep then, and `watch` knows.
@@ -303,17 +308,21 @@ class Capture:
         except FoveascanError as error:
             running.leave(str(error))
             self.counts.interrupted += 1
-            if not isinstance(error, DriverError):
+            stays_ready = not isinstance(error, DriverError) or isinstance(error, Unsupported)
+            if stays_ready:
                 self._end(str(error))
             self._watch(SweepInterrupted(str(error), None, SweepReport()))
-            if isinstance(error, DriverError):
+            if not stays_ready:
                 raise
 
-    def _follow(self, events: SweepEvents, running: RunningSweep) -> None:
+    def _follow(self, events: TurnEvents, running: RunningSweep) -> None:
         """Hand every event to whom it concerns. Raises FoveascanError."""
         with closing(events):
             for event in events:
                 self._beat()
+                if isinstance(event, TurnStarted):
+                    running.begin_turn(event)
+                    continue
                 self.counts.take(event)
                 match event:
                     case SweepStarted(header):

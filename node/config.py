@@ -55,6 +55,7 @@ class Capture(Struct, frozen=True, forbid_unknown_fields=True):
     passes: Annotated[int, Meta(ge=1, le=64)] = 1  # turns that are averaged: noise falls with their square root
     overlap: Annotated[int, Meta(ge=0, le=255)] = 0  # [1/256 turn] seen again at the end, to tell noise and slip
     stride: Annotated[int, Meta(ge=1, le=255)] = 1  # >1: a fast turn with every so many-th column comes first
+    apart: bool = False  # range in one turn, texture in another; done anyway where the scanner takes no other
     repair: bool = True  # take spikes out and fill holes of up to 3 cells; a scan keeps what was measured there
 
     def __post_init__(self) -> None:

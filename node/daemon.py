@@ -21,7 +21,7 @@ from drivers.scanner import SweepEvent
 from node.access import Access, access_folder
 from node.advertise import Advertisement
 from node.assemble import Assembly
-from node.capture import Capture
+from node.capture import Capture, Manner
 from node.config import Config
 from node.exhibits import Exhibits
 from node.identity import node_identity
@@ -61,7 +61,7 @@ class Node:
         self.config = change.config
         set_log(change.config.log.level, change.config.log.format)
         if self.capture is not None:
-            self.capture.sweep_like(sweep_request(change.config))
+            self.capture.sweep_like(manner_of(change.config))
         return str(change)
 
     def parts(self) -> dict[str, Beating]:
@@ -175,14 +175,13 @@ def _capture(
 
     opened = partial(open_port, address, config.capture.baud)
     link = config_for(address, config.capture.stale_s)
-    request, repair = sweep_request(config), config.capture.repair
-    return Capture(opened, link, deliver, watch, library.sweeps, request, repair), announce
+    return Capture(opened, link, deliver, watch, library.sweeps, manner_of(config)), announce
 
 
-def sweep_request(config: Config) -> SweepRequest:
+def manner_of(config: Config) -> Manner:
     """How to sweep."""
     c = config.capture
-    return SweepRequest(passes=c.passes, overlap=c.overlap, stride=c.stride)
+    return Manner(SweepRequest(passes=c.passes, overlap=c.overlap, stride=c.stride), c.apart, c.repair)
 
 
 def _server_info(config: Config, folder: Path) -> m.ServerInfo:

@@ -5,7 +5,8 @@
 A journal is a row of records: magic, length, checksum, and as payload some messages, each behind its type and length.
 The messages are those of the scanner link, byte for byte; the first record has BEGIN (our own: format and time),
 HELLO_ACK and SWEEP_HEADER, the others have columns, the last one has SWEEP_END where the scanner's count agreed with
-ours, or ERROR with the reason of an early end.
+ours, or ERROR with the reason of an early end. Where range and texture have turns of their own, SWEEP_HEADER comes
+again before each turn's columns: as the scanner said it, but for `passes`, which counts the turns of that channel.
 A record stands for itself: a torn tail costs that record, a rotten stretch in the middle costs what lies in it.
 A sweep is complete when it has every piece that its header promises and a SWEEP_END that agrees with them, whoever
 asks and whenever: pieces that nobody counted, or that were counted otherwise, do not become a scan by themselves.
@@ -27,6 +28,7 @@ from drivers.ledger import Ledger
 from node.background_writer import BackgroundWriter
 from node.durable import NEW, disk_error, require_room, sync_folder, write_whole
 from node.scan_folder import Problem
+from node.turns import TurnStarted
 from protocol.checksum import crc32
 from protocol.errors import LibraryError, RemoteWireError
 from protocol.scanner_messages import (
@@ -69,6 +71,7 @@ class Interrupted:
 
     started_unix_s, ended_unix_s : by the node's clock.  info : the scanner that made it.  why : what ended it.
     held, expected : pieces of columns on disk, and those a complete sweep has.  damaged_bytes : rotten ones set aside.
+    turn : the one that was under way, where range and texture had turns of their own.
     is_complete : whether every column is there, as the scanner counted them: a scan can be made without the scanner.
     """
 
@@ -83,6 +86,7 @@ class Interrupted:
     damaged_bytes: int
     why: str
     is_complete: bool
+    turn: TurnStarted | None = None
 
 
 class Journal:
@@ -100,6 +104,10 @@ class Journal:
         self._take(column)
         if self._size >= RECORD_BYTES:
             self.flush()
+
+    def begin_turn(self, turn: TurnStarted) -> None:
+        """The columns that follow are of this turn."""
+        self._take(replace(turn.header, passes=turn.pass_index + 1))
 
     def flush(self) -> None:
         """Send what was taken on its way to the disk; call it now and then, it bounds what a crash costs."""
@@ -333,6 +341,7 @@ def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
     started_unix_s, info, header = _decode_opening(opening)
     ledger, read_bytes, why = Ledger(header), end, CUT_SHORT
     counted: SweepEnd | None = None
+    turn: TurnStarted | None = None
     for place, payload in records:
         end, read_bytes = place, read_bytes + _RECORD.size + len(payload)
         for message in _messages_in(payload):
@@ -340,12 +349,14 @@ def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
                 why = message.text
             elif isinstance(message, SweepEnd):
                 counted = message
+            elif isinstance(message, SweepHeader):
+                turn = TurnStarted(replace(message, passes=1), message.passes - 1)
             elif isinstance(message, RangeColumn | TextureColumn):
                 ledger.take(message)
     is_complete = counted == SweepEnd(header.sweep, Outcome.COMPLETE, ledger.expected, ledger.digest)
     counts = ledger.held, ledger.expected, end, end - read_bytes
     said = COMPLETE if is_complete else why
-    return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, said, is_complete)
+    return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, said, is_complete, turn)
 
 
 def _record_at(data: bytes | mmap.mmap, at: int) -> memoryview | None:

@@ -10,7 +10,7 @@ import msgspec
 from node.config import Config
 
 LIVE = frozenset({
-    "capture.passes", "capture.overlap", "capture.stride",
+    "capture.passes", "capture.overlap", "capture.stride", "capture.apart", "capture.repair",
     "server.certificate", "server.key", "server.max_clients",
     "planner.cold_start_bytes_s",
     "retention.max_age_days", "retention.max_gb",

@@ -7,7 +7,7 @@ sweep up, is homed; if its calibration is the same, it sweeps again, and what wa
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 
@@ -15,6 +15,7 @@ from drivers.ledger import Ledger
 from drivers.scanner import Scanner, SweepEvent, SweepFinished, SweepInterrupted, SweepReport, SweepStarted
 from node.assemble import Assembler, Assembly, Encoder
 from node.journal import Interrupted, Journals
+from node.turns import STOPPED, TurnEvents, gone_on
 from protocol.errors import FoveascanError, ScannerFault
 from protocol.scanner_messages import (
     Column,
@@ -26,24 +27,28 @@ from protocol.scanner_messages import (
 )
 
 RESUME_WITHIN_S = 30.0  # a cut sweep goes on by itself this soon; later, whoever stood on the table may have left it
-STOPPED = "stopped"  # how drivers.sweep calls the end that we asked for
 
 
 def resumed(
     scanner: Scanner, info: DeviceInfo, sweep: Interrupted, held: list[Column], stop: threading.Event
-) -> Generator[SweepEvent, None, None]:
-    """What is missing of a sweep, as Scanner.sweep would tell it; its columns fit the sweep's own header.
+) -> TurnEvents:
+    """What is missing of a sweep, as node.turns.swept would tell it; its columns fit the sweep's own header.
 
     info : the scanner that is there now.  held : the columns kept.  Raises DriverError as Scanner.sweep does.
     """
     if info.serial_number != sweep.info.serial_number:
         yield _refusal(f"it was begun by scanner {sweep.info.serial_number}, this is {info.serial_number}")
         return
+    is_same_boot = info.boot_id == sweep.info.boot_id
+    if sweep.turn is not None:
+        turn = sweep.turn if is_same_boot else None
+        yield from gone_on(scanner, sweep.header, turn, held, stop, anew=True)
+        return
     yield SweepStarted(sweep.header)
     ledger = Ledger(sweep.header)
     for column in held:
         ledger.take(column)
-    if info.boot_id == sweep.info.boot_id:
+    if is_same_boot:
         with closing(scanner.resume(sweep.header, held, stop)) as events:
             for event in events:
                 if isinstance(event, SweepInterrupted) and isinstance(event.cause, ScannerFault):
@@ -55,6 +60,15 @@ def resumed(
             else:
                 return
     yield from _swept_again(scanner, sweep.header, ledger, stop)
+
+
+def resumed_by_itself(
+    scanner: Scanner, sweep: Interrupted, held: list[Column], stop: threading.Event
+) -> TurnEvents:
+    """As resumed, for a scanner that was cut off a moment ago: what it knows no longer is not taken again."""
+    if sweep.turn is not None:
+        return gone_on(scanner, sweep.header, sweep.turn, held, stop, anew=False)
+    return scanner.resume(sweep.header, held, stop)
 
 
 def cut_lately(sweeps: Sequence[Interrupted], info: DeviceInfo, now_unix_s: float) -> Interrupted | None:
@@ -91,7 +105,7 @@ def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Assembly], 
     assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
     for column in sweeps.columns(sweep.id):
         add_column(assembler, column)
-    deliver(assembler.assembly(repairs=repairs))
+    deliver(assembler.assembly(repairs=repairs, apart=sweep.turn is not None))
     sweeps.delete(sweep.id)
 
 

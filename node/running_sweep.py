@@ -10,6 +10,7 @@ from drivers.scanner import SweepReport
 from node.assemble import Assembler, Assembly
 from node.journal import Journal, Journals
 from node.resume import add_column, encoder_of
+from node.turns import TurnStarted
 from protocol.errors import RemoteWireError, ScannerFault
 from protocol.scanner_messages import Column, DeviceInfo, Outcome, SweepEnd, SweepHeader
 
@@ -38,6 +39,7 @@ class RunningSweep:
         self._sweep_id = sweep_id
         self._journal: Journal | None = None
         self._sweep = 0
+        self._has_turns = False
         self._assembler: Assembler | None = None
 
     def begin(self, header: SweepHeader) -> None:
@@ -60,6 +62,12 @@ class RunningSweep:
             self._journal.add(column)
         self._assemble(column)
 
+    def begin_turn(self, turn: TurnStarted) -> None:
+        """The columns that follow are of this turn. Raises LibraryError where it fits no disk."""
+        self._has_turns = True
+        if self._journal is not None:
+            self._journal.begin_turn(turn)
+
     def flush(self) -> None:
         """See to it that what was taken gets to the disk. Raises LibraryError."""
         if self._journal is not None:
@@ -69,7 +77,7 @@ class RunningSweep:
         """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
         assert self._assembler is not None
         self.flush()
-        assembly = self._assembler.assembly(repairs=self._repairs)
+        assembly = self._assembler.assembly(repairs=self._repairs, apart=self._has_turns)
         quality = replace(
             assembly.quality, requested_columns=report.requested_columns, dropped_bytes=report.dropped_bytes
         )

@@ -9,6 +9,7 @@ FoveascanError
 ├── DriverError
 │   ├── PortLost         the port or the device behind it is gone
 │   └── ScannerFault     the scanner answered, and said no
+│       └── Unsupported  since it cannot do such a thing
 ├── LibraryError         a scan on disk that cannot be read, written or found
 ├── AccessError          who may come in: a certificate, token or code that cannot be read, written or found
 ├── InstallError         the service cannot be installed, updated or removed
@@ -51,6 +52,10 @@ class PortLost(DriverError):
 
 class ScannerFault(DriverError):
     """The scanner answered, and said no."""
+
+
+class Unsupported(ScannerFault):
+    """The scanner cannot do what was asked."""
 
 
 class LibraryError(FoveascanError):

@@ -65,6 +65,12 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     )
     simulate.add_argument("--order", choices=("live", "buffered"), default="live", help="of the columns (live)")
     simulate.add_argument(
+        "--channels",
+        choices=("any", "apart", "together"),
+        default="any",
+        help="what one turn takes: range and texture apart, together, or as asked for (any)",
+    )
+    simulate.add_argument(
         "--retention", type=_whole(1, 65535), default=65535, help="columns held to be sent again (65535)"
     )
     simulate.add_argument("--serial-number", default="SIM-0001", help="of the scanner (SIM-0001)")
@@ -101,9 +107,10 @@ def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
     from protocol.framing import SERIAL_PAYLOAD_MAX, USB_PAYLOAD_MAX
     from protocol.scanner_messages import Order
     from simulators.faults import FaultyScanner, parse_faults
-    from simulators.scanner import SimulatedScanner
+    from simulators.scanner import ANY_CHANNELS, APART, TOGETHER, SimulatedScanner
     from simulators.turntable import Turntable
 
+    channels = {"any": ANY_CHANNELS, "apart": APART, "together": TOGETHER}
     faults, flaws = parse_faults(args.faults, args.seed)
 
     def boot(boot_id: int) -> SimulatedScanner:
@@ -115,6 +122,7 @@ def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
             retention_columns=args.retention,
             payload_max=SERIAL_PAYLOAD_MAX if args.link == "pty" else USB_PAYLOAD_MAX,
             order=Order[args.order.upper()],
+            channels=channels[args.channels],
         )
 
     return FaultyScanner(boot, faults, args.seed)

@@ -56,9 +56,9 @@ class Faults:
 
 
 _FLAW_NAMES = {
-    "reversed": "is_reversed", "ticks": "lost_ticks", "slip": "slip_turns", "overshoot": "overshoot_turns",
-    "dead": "dead_rows", "saturated": "saturated_columns", "spikes": "spikes", "dropouts": "dropouts",
-    "noise": "noise_steps",
+    "reversed": "is_reversed", "ticks": "lost_ticks", "slip": "slip_turns", "nudge": "nudge_turns",
+    "overshoot": "overshoot_turns", "dead": "dead_rows", "saturated": "saturated_columns", "spikes": "spikes",
+    "dropouts": "dropouts", "noise": "noise_steps",
 }  # fmt: skip
 FAULT_NAMES = tuple(field.name for field in fields(Faults)) + tuple(_FLAW_NAMES)
 
@@ -106,7 +106,7 @@ class FaultyScanner:
     """What a carrier talks to, with faults on the way.
 
     boot : makes the device, given its boot id; called again when it resets.
-    Stall, reset and unplug happen once, somewhere in the first sweep.
+    Stall, reset and unplug happen once, somewhere in the first sweep, or in its second turn.
     """
 
     def __init__(self, boot: Callable[[int], SimulatedScanner], faults: Faults, seed: int = 0) -> None:
@@ -116,7 +116,7 @@ class FaultyScanner:
         self._boots = 1
         self.device = boot(self._boots)
         self.portion_bytes = int(faults.dribble) or None
-        self._mishap_in = -1  # columns to go until the one mishap; below 0 it is not known yet
+        self._mishap_in: int | None = None  # columns to go until the one mishap; below 0 it has been
         self._silent_until_s = 0.0
         self._delayed = b""
         self._held_back: list[tuple[int, bytes]] = []
@@ -158,11 +158,11 @@ class FaultyScanner:
         """Whether now is the time for what happens once."""
         if not (self._faults.stall or self._faults.reset or self._faults.unplug):
             return False
-        if frame[3] == SweepHeader.TYPE and self._mishap_in < 0:
+        if frame[3] == SweepHeader.TYPE and self._mishap_in is None:
             header = SweepHeader.from_bytes(frame[_HEADER_BYTES:-4])
             columns = header.passes * (header.spec.width + header.spec.texture_width)
             self._mishap_in = int(columns * self._rng.uniform(0.15, 0.85))
-        if frame[3] not in _COLUMN_TYPES or self._mishap_in < 0:
+        if frame[3] not in _COLUMN_TYPES or self._mishap_in is None:
             return False
         self._mishap_in -= 1
         return self._mishap_in == 0

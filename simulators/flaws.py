@@ -20,7 +20,8 @@ class Flaws:
     """A set of flaws; by default there are none.
 
     is_reversed : the table turns clockwise, and the encoder says so.   lost_ticks : counts that the encoder misses,
-    `mishap_turns` after the start.   slip_turns : how far what stands on the table slides against it, there and then.
+    `mishap_turns` after the start.   slip_turns : how far what stands on the table slides against it, there in the
+    first sweep since power on, to stay there.   nudge_turns : how far somebody turns it after that sweep.
     overshoot_turns : how far the table runs on, still exposing columns.
     dead_rows : rows of the range camera that measure nothing.   saturated_columns : texture columns blinded in a pass.
     spikes, dropouts : share of range samples far off, or void.   noise_steps : standard deviation of the range.
@@ -30,6 +31,7 @@ class Flaws:
     is_reversed: bool = False
     lost_ticks: int = 0
     slip_turns: float = 0.0
+    nudge_turns: float = 0.0
     mishap_turns: float = 0.4
     overshoot_turns: float = 0.0
     dead_rows: int = 0
@@ -43,10 +45,10 @@ class Flaws:
         missed = self.lost_ticks if abs(turned) >= self.mishap_turns * counts_per_turn else 0
         return turned - missed if turned >= 0 else turned + missed
 
-    def turns_seen(self, turned: int, counts_per_turn: int) -> float:
-        """How far round the specimen the cameras look then. [turns]"""
-        slid = self.slip_turns if abs(turned) >= self.mishap_turns * counts_per_turn else 0.0
-        return turned / counts_per_turn + slid
+    def turns_seen(self, turned: int, counts_per_turn: int, sweep: int) -> float:
+        """How far round the specimen the cameras look then, in sweep 1, 2, ... since power on. [turns]"""
+        has_slid = sweep > 1 or abs(turned) >= self.mishap_turns * counts_per_turn
+        return turned / counts_per_turn + self.slip_turns * has_slid + self.nudge_turns * (sweep > 1)
 
     def range_seen(self, steps: StepArray, pass_index: int, column: int) -> StepArray:
         """(H,) what the range camera makes of a column."""

@@ -14,6 +14,7 @@ from protocol.scanner_messages import (
     RUNS_MAX,
     Calibrate,
     Calibration,
+    Channel,
     Column,
     ColumnsGone,
     DeviceInfo,
@@ -38,12 +39,17 @@ _STATUS_S = 0.5
 _STATUS_STARVED_S = 0.1
 _STEP_S = 0.005  # while the table moves and nothing can be sent
 _IDLE_S = 0.5
+_IN_A_TURN = {Channel.RANGE: "range alone", Channel.TEXTURE: "texture alone", Channel.BOTH: "both"}
+ANY_CHANNELS = (Channel.RANGE, Channel.TEXTURE, Channel.BOTH)
+APART = (Channel.RANGE, Channel.TEXTURE)
+TOGETHER = (Channel.BOTH,)
 
 
 class SimulatedScanner:
     """The device at the end of a line; a carrier moves its bytes and tells it the time.
 
     boot_id : another one stands for a device that was switched off and on.
+    channels : what it takes in one turn; a scanner of one camera at a time takes range and texture apart.
     """
 
     portion_bytes: int | None = None
@@ -58,12 +64,14 @@ class SimulatedScanner:
         retention_columns: int = 65535,
         payload_max: int = SERIAL_PAYLOAD_MAX,
         order: Order = Order.LIVE,
+        channels: tuple[Channel, ...] = ANY_CHANNELS,
     ) -> None:
         counts = table.counts_per_turn
         self.info = DeviceInfo(serial_number, boot_id, counts, retention_columns, "simulator", order, payload_max)
         self.state = State.IDLE
         self._table = table
         self._calibration = calibration
+        self._channels = channels
         self._link = ScannerLink(Role.DEVICE, info=self.info, payload_max=payload_max)
         self._now_s: float | None = None
         self._status_s = 0.0
@@ -156,6 +164,9 @@ class SimulatedScanner:
         self.state, self._sweep, self._request = State.IDLE, None, None
 
     def _configure(self, request: SweepRequest) -> tuple[NakCode, str] | None:
+        if request.channels not in self._channels:
+            takes = ", ".join(_IN_A_TURN[channels] for channels in self._channels)
+            return NakCode.UNSUPPORTED, f"one turn takes {takes}, not {_IN_A_TURN[request.channels]}"
         spec = self._table.specimen.grid.spec
         sizes = {
             "width": (request.width, spec.width),

@@ -93,6 +93,7 @@ class Turntable:
         self._flaws = flaws
         self._sense = -1 if flaws.is_reversed else 1
         self._haste = 1  # how many times faster than a whole pass the first turn goes
+        self._sweeps = 0
         self._rng = np.random.default_rng(seed)
         self._time_s = 0.0
         self._position = 0.0  # counts since the home mark of this movement
@@ -125,6 +126,7 @@ class Turntable:
         if abs(self.home_encoder) + goal + self.counts_per_turn >= _COUNT_LIMIT:
             raise ValueError(f"{passes} passes of {self.counts_per_turn} counts overrun the encoder")
         self._set_out(self._plan(channels, passes, overlap, stride), goal)
+        self._sweeps += 1
         self._haste = stride
 
     def halt(self) -> None:
@@ -148,7 +150,7 @@ class Turntable:
     def samples(self, exposure: Exposure) -> StepArray | ImageArray:
         """What the camera saw: (H,) uint16 steps or (Ht, 3) uint8 RGB."""
         spec, flaws = self.specimen.grid.spec, self._flaws
-        turns = flaws.turns_seen(exposure.turned, self.counts_per_turn)
+        turns = flaws.turns_seen(exposure.turned, self.counts_per_turn, self._sweeps)
         angle_rad = spec.theta0_rad + 2 * math.pi * turns
         place = exposure.pass_index, exposure.column
         if exposure.channel is Channel.RANGE:

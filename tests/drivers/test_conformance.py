@@ -1,6 +1,7 @@
 """The checks for firmware authors: a good device passes them all, and each fault is named by the check it is for."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,18 +12,18 @@ from protocol.grid import Grid, GridSpec, ImageArray, StepArray
 from protocol.scanner_link import Event, ScannerLink
 from protocol.scanner_messages import Channel, Hello
 from simulators.carriers import Line, MemoryPort, clean_line
-from simulators.scanner import SimulatedScanner
+from simulators.scanner import APART, SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.turntable import Exposure, Turntable
 
 SPEC = GridSpec(32, 200, 64, 300, 0.01, 1.0)
 
 
-def device() -> SimulatedScanner:
+def device(**kinds: Any) -> SimulatedScanner:
     rng = np.random.default_rng(5)
     steps = rng.integers(1, 60000, (SPEC.height, SPEC.width)).astype(np.uint16)
     texture = rng.integers(0, 256, (SPEC.texture_height, SPEC.texture_width, 3)).astype(np.uint8)
-    return SimulatedScanner(Turntable(Specimen("noise", Grid(SPEC, steps, texture)), turn_s=0.2))
+    return SimulatedScanner(Turntable(Specimen("noise", Grid(SPEC, steps, texture)), turn_s=0.2), **kinds)
 
 
 def examined(scanner: SimulatedScanner, to_node: Line = clean_line) -> dict[str, Finding]:
@@ -36,8 +37,20 @@ def problems(findings: dict[str, Finding]) -> set[str]:
 
 def test_a_device_that_follows_the_protocol_passes_every_check() -> None:
     findings = examined(device())
-    assert problems(findings) == set() and len(findings) == 13
+    assert problems(findings) == set() and len(findings) == 14
     assert "SIM-0001" in findings["greeting"].found
+
+
+def test_a_device_of_one_camera_at_a_time_passes_every_check() -> None:
+    findings = examined(device(channels=APART))
+    assert problems(findings) == set() and len(findings) == 14
+    assert findings["channels of one turn"].found == "each in a turn of its own"
+    assert findings["a sweep"].found.count("digest agrees") == 2
+
+
+def test_a_device_without_texture_is_told_so_and_checked_no_further() -> None:
+    *_, last = examined(device(channels=(Channel.RANGE,))).values()
+    assert (last.check, last.state) == ("channels of one turn", "problem") and "code 5" in last.cure
 
 
 def test_a_silent_port_is_one_problem_with_a_hint() -> None:

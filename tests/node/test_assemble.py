@@ -304,15 +304,3 @@ def test_a_fast_first_turn_and_the_columns_between_make_the_grid() -> None:
     _add_range(assembler, grid, later, [c for c in range(SPEC.width) if c % 4])
     _add_texture(assembler, grid, later, [c for c in range(SPEC.texture_width) if c % 4])
     assert _same(assembler.finish(), grid)
-
-
-def test_a_range_only_and_a_texture_only_sweep_are_registered_by_the_encoder() -> None:
-    grid, here, there = _random_grid(SPEC, 4), Encoder(COUNTS, 100), Encoder(COUNTS, -7000, -1)
-    ranged, textured = Assembler(SPEC, here), Assembler(SPEC, there)
-    _add_range(ranged, grid, here, range(SPEC.width))
-    _add_texture(textured, grid, there, range(SPEC.texture_width))
-    with pytest.raises(IncompleteTurn):
-        ranged.finish()
-    assert _same(ranged.with_texture_of(textured).finish(), grid)
-    with pytest.raises(ValueError, match="same grid and table"):
-        ranged.with_texture_of(Assembler(SPEC, Encoder(COUNTS + 1)))

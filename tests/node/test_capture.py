@@ -14,7 +14,7 @@ from drivers.scanner import Scanner, ScannerConfig, SweepInterrupted, SweepProgr
 from drivers.serial_port import SerialPort
 from node import capture, durable
 from node.assemble import Assembly
-from node.capture import Capture, CaptureStatus
+from node.capture import Capture, CaptureStatus, Manner
 from node.journal import Journals
 from node.scan_quality import coverage_of
 from protocol.errors import PortLost
@@ -78,7 +78,7 @@ def test_a_scan_comes_with_its_quality_and_what_was_measured_where_it_was_repair
 def test_a_node_that_is_to_repair_nothing_keeps_every_sample(plug: Plug, tmp_path: Path) -> None:
     made: queue.Queue[Assembly] = queue.Queue()
     plug.plug(device())
-    swept = Capture(lambda: SerialPort(str(tmp_path / "tty")), ScannerConfig(), made.put, repairs=False)
+    swept = Capture(lambda: SerialPort(str(tmp_path / "tty")), ScannerConfig(), made.put, manner=Manner(repairs=False))
     swept.start()
     while not swept.request_sweep():
         time.sleep(0.01)
@@ -154,7 +154,7 @@ def test_a_sweep_is_asked_for_as_the_node_is_set(plug: Plug, tmp_path: Path) -> 
     made: queue.Queue[Assembly] = queue.Queue()
     plug.plug(device())
     request = SweepRequest(passes=2, overlap=64)
-    swept = Capture(lambda: SerialPort(str(tmp_path / "tty")), ScannerConfig(), made.put, request=request)
+    swept = Capture(lambda: SerialPort(str(tmp_path / "tty")), ScannerConfig(), made.put, manner=Manner(request))
     swept.start()
     while not swept.request_sweep():
         time.sleep(0.01)

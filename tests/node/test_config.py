@@ -57,7 +57,7 @@ def test_an_override_mends_a_file_that_would_be_refused_without_it(tmp_path: Pat
         ('[capture]\nscanner = ""', "capture.scanner: expected str of length >= 1"),
         (
             "[capture]\nbauds = 1",
-            "capture.bauds: unknown key; known here: scanner, baud, stale_s, passes, overlap, stride, repair",
+            "capture.bauds: unknown key; known here: scanner, baud, stale_s, passes, overlap, stride, apart, repair",
         ),
         ("[cap]\nbaud = 1", f"cap: unknown key; known here: {', '.join(Config.__struct_fields__)}"),
         ("capture = 3", "capture: expected a table, got int"),

@@ -9,6 +9,7 @@ import pytest
 
 from drivers.scanner import SweepInterrupted, SweepReport, SweepStarted
 from node.assemble import Assembly
+from node.capture import Manner
 from node.journal import Journals
 from node.library import content_id
 from node.resume import publish_complete
@@ -21,7 +22,7 @@ from tests.node.capturing import SPEC, WAIT_S, Node, Plug, cut, device, is_truth
 
 
 def test_a_sweep_with_an_overlap_goes_on_with_a_scanner_that_was_restarted(plug: Plug, node: Node) -> None:
-    node.capture._sweep_request = SweepRequest(overlap=64)
+    node.capture.sweep_like(Manner(SweepRequest(overlap=64)))
     sweep_id = cut(plug, node, device(boot_id=2))
     assert node.sweeps.get(sweep_id).header.overlap == 64
     assert node.capture.request_resume(sweep_id)

@@ -25,13 +25,14 @@ from drivers.usb_port import UsbAddress, UsbPort
 from node.assemble import Assembler, Assembly
 from node.journal import Interrupted, Journal, Journals
 from node.resume import add_column, encoder_of
+from node.turns import TurnEvents, TurnStarted, gone_on, swept
 from protocol.errors import DriverError, PortLost
 from protocol.framing import USB_PAYLOAD_MAX
 from protocol.grid import Grid, GridSpec
-from protocol.scanner_messages import Column, DeviceInfo, Order, RangeColumn, SweepRequest, TextureColumn
+from protocol.scanner_messages import Channel, Column, DeviceInfo, Order, RangeColumn, SweepRequest, TextureColumn
 from simulators.carriers import MemoryPort, PtyPort, ServedPort, serve
 from simulators.faults import FaultyScanner, parse_faults
-from simulators.scanner import SimulatedScanner
+from simulators.scanner import ANY_CHANNELS, SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.tcp_carrier import TcpListener
 from simulators.turntable import Turntable
@@ -74,6 +75,7 @@ class Bench:
     retention_columns: int = 65535
     payload_max: int = 1024
     place: int = 1  # where on the bus it is plugged in
+    channels: tuple[Channel, ...] = ANY_CHANNELS  # what one turn takes
 
     def scanner(self) -> FaultyScanner:
         """The device on its bad day."""
@@ -85,7 +87,7 @@ class Bench:
             )
             return SimulatedScanner(
                 table, serial_number=self.serial_number, boot_id=boot_id, order=self.order,
-                retention_columns=self.retention_columns, payload_max=self.payload_max,
+                retention_columns=self.retention_columns, payload_max=self.payload_max, channels=self.channels,
             )  # fmt: skip
 
         return FaultyScanner(boot, faults, self.seed)
@@ -170,7 +172,7 @@ def _served(bench: Bench, port: ServedPort) -> Iterator[None]:
 
 @dataclass
 class Ending:
-    """What became of a sweep. kept : the sweeps that lie on disk, cut."""
+    """What became of a sweep. kept : the sweeps that lie on disk, cut.  turns : which channel each of them took."""
 
     kind: Kind
     why: str = ""
@@ -178,6 +180,7 @@ class Ending:
     assembly: Assembly | None = None
     kept: list[Interrupted] = field(default_factory=list)
     resumed: int = 0
+    turns: list[Channel] = field(default_factory=list)
 
     def equals(self, truth: Grid) -> bool:
         """Whether this is a scan, and the same as without any fault."""
@@ -200,6 +203,7 @@ class Capturing:
         self._assembler: Assembler | None = None
         self._held: list[Column] = []
         self._cut: tuple[DeviceInfo, Any] | None = None
+        self._turn: TurnStarted | None = None
         self._ending = Ending("refused")
 
     def run(self) -> Ending:
@@ -225,17 +229,25 @@ class Capturing:
             scanner = Scanner(port, self._line.config, clock=self._line.clock)
             info = scanner.hello()
             if self._cut is None:
-                return self._follow(scanner.sweep(self._request), info)
+                return self._follow(swept(scanner, self._request, threading.Event(), apart=False), info)
             before, header = self._cut
             if (before.serial_number, before.boot_id) != (info.serial_number, info.boot_id):
                 self._ending.why = "another boot"
                 return True
             self._ending.resumed += 1
-            return self._follow(scanner.resume(header, list(self._held)), info)
+            held = list(self._held)
+            if self._turn is None:
+                return self._follow(scanner.resume(header, held), info)
+            return self._follow(gone_on(scanner, header, self._turn, held, threading.Event(), anew=False), info)
 
-    def _follow(self, events: Generator[SweepEvent, None, None], info: DeviceInfo) -> bool:
+    def _follow(self, events: TurnEvents | Generator[SweepEvent, None, None], info: DeviceInfo) -> bool:
         for event in events:
             match event:
+                case TurnStarted(turn):
+                    assert self._journal is not None
+                    self._journal.begin_turn(event)
+                    self._turn = event
+                    self._ending.turns.append(turn.channels)
                 case SweepStarted(header) if self._journal is None:
                     self._journal = self._journals.begin(info, header, time.time())
                     self._assembler = Assembler(header.spec, encoder_of(header))
@@ -255,7 +267,8 @@ class Capturing:
 
     def _finish(self, report: SweepReport) -> None:
         assert self._journal is not None and self._assembler is not None
-        self._ending = replace(self._ending, kind="scan", why="", report=report, assembly=self._assembler.assembly())
+        assembly = self._assembler.assembly(apart=self._turn is not None)
+        self._ending = replace(self._ending, kind="scan", why="", report=report, assembly=assembly)
         self._journal.close()
         self._journals.discard(self._journal)
         self._journal = None

@@ -13,6 +13,7 @@ import pytest
 from node.scan_quality import ScanQuality
 from protocol.errors import PortLost
 from protocol.scanner_messages import Channel, Order, SweepRequest
+from simulators.scanner import APART, TOGETHER
 from simulators.usb_testbed import is_available, is_under_preload
 from tests.system.fault_rig import REQUEST, Bench, Capturing, Ending, Line, bumpy, memory, pty, tcp, usb, usb_double
 
@@ -115,6 +116,41 @@ def test_one_port_opened_twice_is_refused_the_second_time(carrier: Carrier, tmp_
     with carrier(Bench("", 7, tmp_path)) as line, closing(line.open_port()):
         with pytest.raises(PortLost, match="another program"):
             line.open_port()
+
+
+@pytest.mark.parametrize("faults", ["", "loss=0.02"])
+def test_range_and_texture_in_turns_of_their_own_make_the_same_scan(
+    carrier: Carrier, faults: str, tmp_path: Path
+) -> None:
+    bench = Bench(faults, 12, tmp_path, channels=APART)
+    ending = swept(carrier, bench)
+    assert ending.equals(bench.specimen.grid), ending.why
+    assert ending.turns == [Channel.RANGE, Channel.TEXTURE] and ending.assembly is not None
+    assert ending.assembly.quality.complaints == () and ending.assembly.quality.slip_deg == 0.0
+    assert ending.report.requested_columns > 0 or not faults
+
+
+@pytest.mark.parametrize(("seed", "cut"), [(2, Channel.RANGE), (4, Channel.TEXTURE)])
+def test_a_plug_pulled_in_either_turn_costs_nothing(carrier: Carrier, seed: int, cut: Channel, tmp_path: Path) -> None:
+    bench = Bench("unplug=0.2", seed, tmp_path, channels=APART)
+    ending = swept(carrier, bench, SweepRequest())
+    assert ending.equals(bench.specimen.grid), ending.why
+    assert sorted(ending.turns) == sorted([*APART, cut])
+
+
+@pytest.mark.parametrize(("faults", "channels"), [("slip=0.05", TOGETHER), ("slip=0.05", APART), ("nudge=0.05", APART)])
+def test_what_moves_in_a_turn_or_between_two_is_told_by_a_second_pass(
+    carrier: Carrier, faults: str, channels: tuple[Channel, ...], tmp_path: Path
+) -> None:
+    ending = swept(carrier, Bench(faults, 13, tmp_path, channels=channels), SweepRequest(passes=2))
+    assert ending.turns == 2 * [*channels] * (channels is APART) and ending.assembly is not None
+    quality = ending.assembly.quality
+    assert quality.has_slipped and abs(abs(quality.slip_deg or 0) - 18) < 2, quality
+
+
+def test_a_scanner_that_takes_no_texture_says_so_before_it_turns(carrier: Carrier, tmp_path: Path) -> None:
+    ending = swept(carrier, Bench("", 14, tmp_path, channels=(Channel.RANGE,)))
+    assert ending.kind == "refused" and "one turn takes range alone, not both" in ending.why and not ending.kept
 
 
 @pytest.mark.parametrize("faults", ["", "loss=0.02", "unplug=0.2"])

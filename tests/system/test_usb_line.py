@@ -67,8 +67,9 @@ def test_one_seed_gives_one_scan_of_a_jittering_encoder_too(swept: Swept) -> Non
     assert np.array_equal(serial.range_steps, usb.range_steps) and np.array_equal(serial.texture, usb.texture)
 
 
-def test_a_bad_usb_line_costs_the_scan_nothing(swept: Swept) -> None:  # AT-03
-    node, grid = swept("usb", "--faults", "loss=0.05,flip=0.02,truncate=0.01,unplug=0.5")
+@pytest.mark.parametrize(("link", "channels"), [("usb", "any"), ("usb", "apart"), ("pty", "apart")])
+def test_a_bad_line_costs_the_scan_nothing(swept: Swept, link: str, channels: str) -> None:  # AT-03
+    node, grid = swept(link, "--channels", channels, "--faults", "loss=0.05,flip=0.02,truncate=0.01,unplug=0.5")
     assert np.array_equal(grid.range_steps, node.truth.range_steps)
     assert np.array_equal(grid.texture, node.truth.texture)
 
