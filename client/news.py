@@ -10,19 +10,36 @@ from protocol.errors import FoveascanError
 WAITING_MAX = 256
 
 
-class News:
-    """Ids of newly published scans, from its creation on: `async for scan in session.published()`.
+class NewScan(str):
+    """The id of a newly published scan, and how it came about.
 
-    Ends with the session; raises what ended it, or FoveascanError when WAITING_MAX ids were left unread.
+    sweep : which of the node's finished sweeps it is, as session.scanner()["sweeps"] counts them; 0: of no sweep.
+    made_from : ids of the scans that it was made of.
+    """
+
+    sweep: int
+    made_from: tuple[str, ...]
+
+    def __new__(cls, scan: str, sweep: int = 0, made_from: tuple[str, ...] = ()) -> NewScan:
+        """As a node announces it."""
+        new = super().__new__(cls, scan)
+        new.sweep, new.made_from = sweep, made_from
+        return new
+
+
+class News:
+    """Newly published scans, from its creation on: `async for scan in session.published()`.
+
+    Ends with the session; raises what ended it, or FoveascanError when WAITING_MAX scans were left unread.
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[str] = deque()
+        self._waiting: deque[NewScan] = deque()
         self._changed = asyncio.Event()
         self._ended = False
         self._cause: Exception | None = None
 
-    def tell(self, scan: str) -> None:
+    def tell(self, scan: NewScan) -> None:
         """A scan was published."""
         if self._ended:
             return
@@ -41,7 +58,7 @@ class News:
     def __aiter__(self) -> News:
         return self
 
-    async def __anext__(self) -> str:
+    async def __anext__(self) -> NewScan:
         while not self._waiting:
             if self._ended:
                 raise self._cause or StopAsyncIteration

@@ -17,7 +17,7 @@ from weakref import WeakSet
 from client.errors import NodeLost, RequestRefused
 from client.live import LiveFeed
 from client.model import Applied, Model
-from client.news import News
+from client.news import News, NewScan
 from client.replica import Replica
 from client.stream import Stream
 from client.update import Tally, Update
@@ -132,7 +132,7 @@ class Reader:
         return request in self._looking and self.ended is None
 
     def published(self) -> News:
-        """Ids of scans published from now on."""
+        """Scans published from now on."""
         news = News()
         self._news.add(news)
         if self.ended is not None:
@@ -172,9 +172,9 @@ class Reader:
                 await self._state(self._bound().state())
             case m.Refused():
                 self._refuse(said)
-            case m.Published(scan=scan):
+            case m.Published(scan, sweep, made_from):
                 for news in list(self._news):
-                    news.tell(scan)
+                    news.tell(NewScan(scan, sweep, made_from))
             case LiveColumns() | m.LiveStarted() | m.LiveProgress() | m.LiveEnded():
                 self.live.take(said)
             case m.Goodbye(reason=reason):

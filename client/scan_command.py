@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from client.arguments import add_node, chosen_node
 from protocol.printable import printable
@@ -65,21 +65,21 @@ async def _sweep(session: Session, *, silent: bool) -> str:
     from protocol.errors import ScannerFault
 
     published = session.published()
-    before = await _ready(session)
-    await session.start_sweep()
+    await _ready(session)
+    number = (await session.start_sweep())["sweep"]
     with tqdm(total=100, unit="%", desc="sweeping", leave=False, disable=True if silent else None) as bar:
         while True:
             await asyncio.sleep(POLL_S)
             status = await session.scanner()
             bar.update(round(100 * status["progress"]) - bar.n)
-            if status["sweeps"] > before["sweeps"]:
-                return await anext(published)
+            if status["sweeps"] >= number:
+                return await anext(scan async for scan in published if scan.sweep == number)
             if status["phase"] != "sweeping" and status["why"]:
                 raise ScannerFault(status["why"])
 
 
-async def _ready(session: Session) -> dict[str, Any]:
-    """The scanner's status once it is connected. Raises ScannerFault when there is none, or it does not come."""
+async def _ready(session: Session) -> None:
+    """Wait until the scanner is connected. Raises ScannerFault when there is none, or it does not come."""
     import asyncio
 
     from protocol.errors import ScannerFault
@@ -89,6 +89,6 @@ async def _ready(session: Session) -> dict[str, Any]:
         if status["phase"] == "no scanner":
             raise ScannerFault("this node has no scanner: start it with --scanner ADDRESS")
         if status["phase"] == "ready":
-            return status
+            return
         await asyncio.sleep(POLL_S)
     raise ScannerFault(status["why"] or "the scanner does not answer: is it connected and on?")

@@ -78,6 +78,12 @@ class _Scanner(msgspec.Struct):
     why: str
 
 
+class _Started(_Scanner):
+    """What is read of the answer to POST /v1/sweeps. sweep : which of the finished ones it will be."""
+
+    sweep: int
+
+
 class _Node(msgspec.Struct):
     """What is read of GET /v1/node."""
 
@@ -224,7 +230,10 @@ class Session:
         return await self.look(u, v, **wanted)
 
     def published(self) -> News:
-        """Ids of scans published from now on: `async for scan in session.published()`."""
+        """Scans published from now on: `async for scan in session.published()`.
+
+        Each is its id, a text that also says which sweep it is, or of which scans it was made (client.news.NewScan).
+        """
         return self._reader.published()
 
     async def live(self) -> AsyncGenerator[LiveFrame, None]:
@@ -265,9 +274,12 @@ class Session:
         return dict(said["capture"])
 
     async def start_sweep(self) -> dict[str, Any]:
-        """Start a sweep. Returns at once with what POST /v1/sweeps says; the scan is announced by `published`."""
+        """Start a sweep. Returns at once with what POST /v1/sweeps says; the scan is announced by `published`.
+
+        Its `sweep` is the answer's "sweep".
+        """
         said = await ask(self._http, "POST", f"{self._stream.url}/v1/sweeps")
-        checked(said, _Scanner, f"{self._stream.url} starts a sweep")
+        checked(said, _Started, f"{self._stream.url} starts a sweep")
         return dict(said)
 
     async def close(self) -> None:

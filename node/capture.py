@@ -166,16 +166,17 @@ class Capture:
         """Begin to connect."""
         self._thread.start()
 
-    def request_sweep(self) -> bool:
-        """Ask for a sweep; False, and nothing will come of it, when the scanner is not ready: see status.refusal.
+    def request_sweep(self) -> int:
+        """Ask for a sweep. Returns which of the finished ones it will be, if all goes well: status.sweeps then.
 
+        0, and nothing will come of it, when the scanner is not ready: see status.refusal.
         While the grid of the last sweep is being delivered the next one may be asked for: who hears of the new scan
         hears of it before the thread is done with it.
         """
         return self._request(self._manner)
 
-    def request_resume(self, sweep_id: str) -> bool:
-        """Ask to go on with an interrupted sweep; False as for request_sweep. Raises LibraryError when unknown."""
+    def request_resume(self, sweep_id: str) -> int:
+        """Ask to go on with an interrupted sweep; 0 as for request_sweep. Raises LibraryError when unknown."""
         if self._sweeps is None:
             raise LibraryError("this node keeps no interrupted sweeps")
         self._sweeps.get(sweep_id)
@@ -188,13 +189,14 @@ class Capture:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def _request(self, order: Manner | _Resume) -> bool:
+    def _request(self, order: Manner | _Resume) -> int:
         with self._lock:
             if self._order is not None or (self._status.refusal and not self._all_in):
-                return False
+                return 0
             self._order = order
+            number = self._status.sweeps + 1 + self._all_in
         self._wake()
-        return True
+        return number
 
     def _now(self) -> CaptureStatus:
         """The status, for whoever holds the lock."""
@@ -352,7 +354,8 @@ class Capture:
         self._all_in = True
         try:
             yield
-            self._status = CaptureStatus("ready", 0.0, self._status.sweeps + 1)
+            with self._lock:
+                self._status, self._all_in = CaptureStatus("ready", 0.0, self._status.sweeps + 1), False
         finally:
             self._all_in = False
 

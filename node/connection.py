@@ -127,9 +127,9 @@ class Connection:
         if self.scan_id == scan_id:
             self._bound, self._is_gone = None, True
 
-    def publish(self, scan_id: str) -> None:
+    def publish(self, news: m.Published) -> None:
         """Tell the client of a new scan, when it is listening."""
-        self._news.append(m.Published(scan_id))
+        self._news.append(news)
         self._work.set()
 
     def show_live(self) -> None:

@@ -126,7 +126,7 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
     server = NodeServer(config, info, exhibits, live, capture, access, tls)
     host, port = await server.start()
     stack.push_async_callback(server.stop)
-    announce.append(lambda scan_id: loop.call_soon_threadsafe(server.swept, scan_id))
+    announce.append(lambda scan_id, sweep: loop.call_soon_threadsafe(server.swept, scan_id, sweep))
     if capture is not None:
         capture.start()
         stack.push_async_callback(asyncio.to_thread, capture.stop)
@@ -153,9 +153,9 @@ def _keep(library: Library, assembly: Assembly) -> Scan:
 
 def _capture(
     config: Config, library: Library, live: Live, way: RightOfWay
-) -> tuple[Capture | None, list[Callable[[str], object]]]:
-    """The capture thread's owner, and the list of who is told of each new scan."""
-    announce: list[Callable[[str], object]] = []
+) -> tuple[Capture | None, list[Callable[[str, int], object]]]:
+    """The capture thread's owner, and the list of who is told of each new scan, and which sweep it is."""
+    announce: list[Callable[[str, int], object]] = []
     address = config.capture.scanner
     if address is None:
         return None, announce
@@ -167,7 +167,7 @@ def _capture(
             log.warning("scan: %s", complaint)
         live.published(scan.id)
         for tell in announce:
-            tell(scan.id)
+            tell(scan.id, capture.status.sweeps + 1)
 
     def watch(event: SweepEvent) -> None:
         way.watch(event)
@@ -175,7 +175,8 @@ def _capture(
 
     opened = partial(open_port, address, config.capture.baud)
     link = config_for(address, config.capture.stale_s)
-    return Capture(opened, link, deliver, watch, library.sweeps, manner_of(config)), announce
+    capture = Capture(opened, link, deliver, watch, library.sweeps, manner_of(config))
+    return capture, announce
 
 
 def manner_of(config: Config) -> Manner:

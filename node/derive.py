@@ -27,6 +27,7 @@ from node.audit_routes import SCAN, WHAT
 from node.auth import require
 from node.exhibits import Exhibits
 from node.library import About, Library, Scan
+from protocol import messages as m
 from protocol.errors import LibraryError
 from protocol.grid import Geometry
 
@@ -85,10 +86,10 @@ def _tipped(wanted: Wanted) -> Iterator[tuple[str, float]]:
 class Derivation:
     """Derives one scan at a time; everything here runs in one event loop.
 
-    published : told the id of each.  audit : where those are noted that nobody asked for.
+    published : told of each.  audit : where those are noted that nobody asked for.
     """
 
-    def __init__(self, exhibits: Exhibits, published: Callable[[str], object], audit: Audit) -> None:
+    def __init__(self, exhibits: Exhibits, published: Callable[[m.Published], object], audit: Audit) -> None:
         self._exhibits = exhibits
         self._audit = audit
         self._published = published
@@ -143,7 +144,7 @@ class Derivation:
 
     async def _made(self, scan_id: str, wanted: Wanted) -> Scan:
         scan = await asyncio.to_thread(derive, self._exhibits.library, scan_id, wanted, self._go_on)
-        self._published(scan.id)
+        self._published(m.Published(scan.id, made_from=scan.about.made_from))
         return scan
 
     def _go_on(self, share: float) -> None:

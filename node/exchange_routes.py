@@ -24,6 +24,7 @@ from node.auth import require
 from node.exhibits import Exhibits
 from node.library import About, Scan
 from node.spool import CHUNK_BYTES, STALL_S, disk_trouble, send, spool
+from protocol import messages as m
 from protocol.errors import LibraryError
 
 IMPORT_BYTES_MAX = 1 << 29
@@ -34,9 +35,9 @@ FORMATS = "|".join(suffix.removeprefix(".").replace(".", r"\.") for suffix in ME
 
 
 class ExchangeRoutes:
-    """The two routes. published : told the id of each scan that was imported."""
+    """The two routes. published : told of each scan that was imported."""
 
-    def __init__(self, exhibits: Exhibits, published: Callable[[str], object]) -> None:
+    def __init__(self, exhibits: Exhibits, published: Callable[[m.Published], object]) -> None:
         self._exhibits = exhibits
         self._published = published
         self._exporting = asyncio.Semaphore(EXPORTS_MAX)
@@ -70,7 +71,7 @@ class ExchangeRoutes:
             before = {scan.id for scan in self._exhibits.library.scans()}
             scan = await self._keep(found)
         request[SCAN] = scan.id
-        self._published(scan.id)
+        self._published(m.Published(scan.id))
         body, status = msgspec.json.encode({"id": scan.id}), 200 if scan.id in before else 201
         return web.Response(body=body, content_type="application/json", status=status)
 

@@ -203,10 +203,13 @@ class NodeServer:
     async def _close_audit(self, app: web.Application) -> None:
         await asyncio.to_thread(self.audit.close)
 
-    def swept(self, scan_id: str) -> None:
-        """A sweep has become a scan: note it, tell every client, and see whether it is to be a sphere, too."""
+    def swept(self, scan_id: str, sweep: int) -> None:
+        """A sweep has become a scan: note it, tell every client, and see whether it is to be a sphere, too.
+
+        sweep : which of the node's finished ones it is.
+        """
         self.audit.note("scanned", NODE, scan=scan_id)
-        self.publish(scan_id)
+        self.publish(m.Published(scan_id, sweep))
         if self._config.library.spheres:
             self.derivation.consider(scan_id)
 
@@ -216,10 +219,10 @@ class NodeServer:
             self._tls.use(config.server)
         self._config = config
 
-    def publish(self, scan_id: str) -> None:
+    def publish(self, news: m.Published) -> None:
         """Tell every client of a new scan."""
         for connection in self._connections:
-            connection.publish(scan_id)
+            connection.publish(news)
 
     def _forget(self, scan_id: str) -> None:
         """A scan was deleted: nothing made of it is kept here any longer."""
@@ -289,9 +292,9 @@ class NodeServer:
 
     async def _sweep(self, request: web.Request) -> web.Response:
         require(request, "operate")
-        if self._capture is None or not self._capture.request_sweep():
+        if self._capture is None or not (number := self._capture.request_sweep()):
             raise web.HTTPConflict(text=self._capture_status().refusal or "the scanner was busy: try again")
-        return _json(asdict(self._capture_status()), status=202)
+        return _json(asdict(self._capture_status()) | {"sweep": number}, status=202)
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         if len(self._connections) >= self._config.server.max_clients:

@@ -238,9 +238,15 @@ class Resync(_Message, frozen=True):
 
 
 class Published(_Message, frozen=True):
-    """A new scan is in the library."""
+    """A new scan is in the library.
+
+    sweep : which of the node's finished sweeps it is, counted as `sweeps` of its scanner's status; 0: of no sweep.
+    made_from : the scans that it was made of.
+    """
 
     scan: ShortText
+    sweep: Count = 0
+    made_from: Annotated[tuple[ShortText, ...], Meta(max_length=16)] = ()
 
 
 class Enveloped(_Message, frozen=True):

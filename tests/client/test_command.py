@@ -205,13 +205,14 @@ class Turntable:
         return web.json_response({"capture": phase})
 
     async def sweep(self, request: web.Request) -> web.Response:
-        return web.json_response(self.phases[0], status=202)
+        return web.json_response({**self.phases[0], "sweep": 1}, status=202)
 
     async def announce(self, line: Line) -> None:
         """The script of the stream."""
         await greet(line)
         await asyncio.to_thread(self.swept.wait, 10)
-        await line.say(m.Published("fresh"))
+        await line.say(m.Published("brought"), m.Published("round", made_from=("old",)))
+        await line.say(m.Published("fresh", 1))
         await line.gone()
 
 

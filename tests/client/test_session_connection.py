@@ -86,13 +86,15 @@ async def test_news_of_scans_reaches_everyone_who_listens() -> None:
     async def script(line: Line) -> None:
         await greet(line)
         await told.wait()
-        await line.say(m.Published("one"), m.Published("two"))
+        await line.say(m.Published("one", 3), m.Published("two", made_from=("one",)))
         await until_gone(line)
 
     async with session_with(script) as session:
         first, second = session.published(), session.published()
         told.set()
-        assert [await anext(first), await anext(first), await anext(second)] == ["one", "two", "one"]
+        swept, made = await anext(first), await anext(first)
+        assert [swept, made, await anext(second)] == ["one", "two", "one"]
+        assert [(news.sweep, news.made_from) for news in (swept, made)] == [(3, ()), (0, ("one",))]
 
 
 async def test_news_that_nobody_reads_is_not_kept_for_ever() -> None:

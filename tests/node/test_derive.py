@@ -129,8 +129,8 @@ async def test_a_second_sweep_of_the_tipped_object_closes_the_first(tmp_path: Pa
 
 async def test_a_sweep_of_a_closed_object_is_kept_as_a_sphere_too(tmp_path: Path) -> None:
     async with node(tmp_path, BALL, CAN) as (_, server, library, ids):
-        for scan in ids:
-            server.swept(scan)
+        for number, scan in enumerate(ids, 1):
+            server.swept(scan, number)
         await asyncio.gather(*server.derivation._tasks)
         made = [scan for scan in library.scans() if scan.about.made_from]
         assert [scan.about.made_from for scan in made] == [(ids[0],)]
@@ -149,7 +149,7 @@ async def test_a_node_that_stops_leaves_what_it_was_deriving(
             return closes(grid)
 
         monkeypatch.setattr(derive, "closes", closes_at_the_end)
-        server.swept(ball)
+        server.swept(ball, 1)
         await asyncio.gather(*server.derivation._tasks)
         assert len(library.scans()) == 1
 

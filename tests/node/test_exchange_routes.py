@@ -21,6 +21,7 @@ from node.auth import LOGIN, Login, Role
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.library import About, Library, content_id
+from protocol import messages as m
 from protocol.errors import LibraryError
 from protocol.grid import Grid
 from tests.exchange.grids import vase
@@ -29,8 +30,8 @@ Client = TestClient[web.Request, web.Application]
 
 
 @asynccontextmanager
-async def serving(folder: Path, role: Role = "operate") -> AsyncIterator[tuple[Client, Exhibits, list[str]]]:
-    """A client of the routes over a library, and the ids that were published."""
+async def serving(folder: Path, role: Role = "operate") -> AsyncIterator[tuple[Client, Exhibits, list[m.Published]]]:
+    """A client of the routes over a library, and what was published."""
 
     @web.middleware
     async def admit(request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -40,7 +41,7 @@ async def serving(folder: Path, role: Role = "operate") -> AsyncIterator[tuple[C
         except LibraryError as problem:
             raise web.HTTPNotFound(text=str(problem)) from problem
 
-    published: list[str] = []
+    published: list[m.Published] = []
     exhibits = Exhibits(Library(folder / "library"), 32768, 1)
     app = web.Application(middlewares=[admit], client_max_size=65536)
     app.add_routes(ExchangeRoutes(exhibits, published.append).routes())
@@ -92,7 +93,7 @@ async def test_what_goes_out_and_in_is_the_same_scan(tmp_path: Path) -> None:
         scan = exhibits.library.add(vase(holes=True), About(0.0, name="vase"))
         body = await (await client.get(f"/v1/scans/{scan.id}.npz")).read()
         answer = await client.post("/v1/scans", data=body)
-        assert answer.status == 200 and await answer.json() == {"id": scan.id} and published == [scan.id]
+        assert answer.status == 200 and await answer.json() == {"id": scan.id} and published == [m.Published(scan.id)]
         assert read_native(io.BytesIO(body))[1].spec == scan.spec
 
 
@@ -101,7 +102,7 @@ async def test_an_imported_grid_is_kept_and_published(tmp_path: Path) -> None:
         answer = await client.post("/v1/scans", data=native(vase(), "a vase"))
         assert answer.status == 201
         scan = exhibits.library.open((await answer.json())["id"])
-        assert scan.id == content_id(vase()) and published == [scan.id]
+        assert scan.id == content_id(vase()) and published == [m.Published(scan.id)]
         assert (scan.about.source, scan.about.name) == ("import", "a vase")
         assert np.array_equal(scan.range_steps, vase().range_steps)
 
@@ -147,7 +148,7 @@ async def test_an_upload_that_ends_early_leaves_nothing(tmp_path: Path) -> None:
         with pytest.raises(Exception, match="cable|Connection|disconnected"):
             await client.post("/v1/scans", data=broken())
         assert (await client.post("/v1/scans", data=native(vase()))).status == 201  # the place is free again
-        assert kept(tmp_path) == {content_id(vase())} == set(published)
+        assert kept(tmp_path) == {content_id(vase())} == {news.scan for news in published}
 
 
 async def test_an_upload_that_stalls_loses_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ class Turntable:
     def beat_s(self) -> float:
         return time.monotonic() - self.silent_s
 
-    def request_sweep(self) -> bool:
+    def request_sweep(self) -> int:
         if self.status.refusal:
             return False
         self.status = CaptureStatus("starting", sweeps=2)

@@ -20,6 +20,8 @@ EVERY: list[m.Message] = [
     m.Updated(1, 5, "complete"),
     m.Resync(2, "digest"),
     m.Published("ab12"),
+    m.Published("ab12", 3),
+    m.Published("ab12", 0, ("cd34", "ef56")),
     m.LiveStarted(1, msgspec.structs.replace(SCAN, id="")),
     m.LiveProgress(1, 41.5, 2.5),
     m.LiveEnded(1, "interrupted", why="the port is gone"),
