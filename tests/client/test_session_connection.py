@@ -247,7 +247,7 @@ async def test_scans_and_sweeps_are_asked_for_over_http() -> None:
         return web.json_response([{"id": "b"}, {"id": "a"}])
 
     async def sweep(request: web.Request) -> web.Response:
-        return web.json_response({"phase": "sweeping", "progress": 0.0, "sweeps": 0, "why": ""}, status=202)
+        return web.json_response({"phase": "sweeping", "progress": 0.0, "sweeps": 0, "why": "", "sweep": 1}, status=202)
 
     async def node(request: web.Request) -> web.Response:
         capture = {"phase": "sweeping", "progress": 0.5, "sweeps": 0, "why": ""}

@@ -40,7 +40,7 @@ def test_a_sweep_becomes_a_grid_and_its_journal_goes(plug: Plug, node: Node, tmp
 
 
 def test_who_hears_of_a_scan_may_ask_for_the_next_one_at_once(plug: Plug, node: Node) -> None:
-    asked: queue.Queue[tuple[bool, bool]] = queue.Queue()
+    asked: queue.Queue[tuple[int, int]] = queue.Queue()
     keep = node.deliver
     grids: list[Grid] = []
 
@@ -54,7 +54,7 @@ def test_who_hears_of_a_scan_may_ask_for_the_next_one_at_once(plug: Plug, node: 
     plug.plug(device())
     node.wait_until("ready")
     assert node.capture.request_sweep()
-    assert asked.get(timeout=WAIT_S) == (True, False)  # the next one, and no third
+    assert asked.get(timeout=WAIT_S) == (2, 0)  # the second one, and no third
     for _ in range(2):
         assert is_truth(node.grids.get(timeout=WAIT_S))
     node.wait_until("ready")

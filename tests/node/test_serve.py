@@ -33,9 +33,9 @@ class Turntable:
 
     def request_sweep(self) -> int:
         if self.status.refusal:
-            return False
+            return 0
         self.status = CaptureStatus("starting", sweeps=2)
-        return True
+        return 3
 
 
 async def ask(node: Client, path: str, method: str = "GET") -> tuple[int, Any]:
@@ -57,7 +57,7 @@ async def test_a_node_without_a_scanner_says_as_much_of_it_as_one_with(tmp_path:
 async def test_a_sweep_that_was_asked_for_is_starting(tmp_path: Path) -> None:
     async with served(Library(tmp_path), Turntable()) as (node, _):
         status, said = await ask(node, "/v1/sweeps", "POST")
-    assert (status, said) == (202, {"phase": "starting", "progress": 0.0, "sweeps": 2, "why": ""})
+    assert (status, said) == (202, {"phase": "starting", "progress": 0.0, "sweeps": 2, "why": "", "sweep": 3})
 
 
 @pytest.mark.parametrize(
