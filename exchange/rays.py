@@ -14,18 +14,24 @@ from protocol.grid import FloatArray, GridSpec, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LevelRays:
-    """Rays at column centres and row centres, all round, level."""
+class _Columns:
+    """Rays at column centres, all round the axis."""
 
     columns: int
     rows: int
     theta0_rad: float
-    z_max_mm: float
-    pitch_mm: float
 
     def angle_rad(self, column: IntArray) -> FloatArray:
         """Angle of columns round the axis (any shape)."""
         return self.theta0_rad + 2 * np.pi * (column + 0.5) / self.columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LevelRays(_Columns):
+    """Rays at column centres and row centres, all round, level."""
+
+    z_max_mm: float
+    pitch_mm: float
 
     def row_at(self, out: FloatArray, z: FloatArray) -> FloatArray:
         """Of places: which row's ray passes through them, in rows and parts of one. [row 0's ray is at 0]"""
@@ -37,17 +43,10 @@ class LevelRays:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StarRays:
+class StarRays(_Columns):
     """Rays at column centres and at the polar angles of row centres, all from one point on the axis."""
 
-    columns: int
-    rows: int
-    theta0_rad: float
     centre_mm: float
-
-    def angle_rad(self, column: IntArray) -> FloatArray:
-        """As that of level rays."""
-        return self.theta0_rad + 2 * np.pi * (column + 0.5) / self.columns
 
     def row_at(self, out: FloatArray, z: FloatArray) -> FloatArray:
         """As that of level rays."""

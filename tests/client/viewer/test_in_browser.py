@@ -11,21 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from foveascan import started
-from tests.client.viewer.browser import blank, click, crop, launch, opened, psnr, wait_drawn, wait_updates
+from tests.client.viewer.browser import blank, click, crop, opened, psnr, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
 
 FAST = ("--link-rate", "20000000")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        running = launch(playwright)
-        yield running
-        running.close()
 
 
 @pytest.fixture(scope="module")

@@ -8,22 +8,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 import hatch_build
-from tests.client.viewer.browser import crop, launch, opened, psnr, wait_drawn, wait_updates
+from tests.client.viewer.browser import crop, opened, psnr, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
 
 AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
 FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        running = launch(playwright)
-        yield running
-        running.close()
 
 
 @pytest.fixture(scope="module")

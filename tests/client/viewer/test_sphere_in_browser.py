@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from playwright.sync_api import Browser, Page, WebSocket, sync_playwright
+from playwright.sync_api import Browser, Page, WebSocket
 
 from client.model import Model
 from foveascan import started
 from protocol.messages import Ack, Opened, decode_message
 from protocol.refinement import Refinement
-from tests.client.viewer.browser import blank, click, crop, launch, opened, psnr, wait_drawn, wait_updates
+from tests.client.viewer.browser import blank, click, crop, opened, psnr, wait_drawn, wait_updates
 from tests.client.viewer.closed_objects import CENTRE_MM, SIZE, STANDING, STEP_MM, TIPPED, bring, grid_of
 
 ABOVE = math.pi / 2 - 1e-4
@@ -35,14 +35,6 @@ class Objects:
     def seen(self, scan: str, elevation: float, distance: float = 200.0) -> str:
         """The address of a view from where theta_h is 0, and from so far up."""
         return f"{self.url}/#scan={scan}&camera=0,{elevation},{distance},0,{CENTRE_MM},0"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        running = launch(playwright)
-        yield running
-        running.close()
 
 
 @pytest.fixture(scope="module")

@@ -8,21 +8,19 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
-from tests.client.viewer.browser import blank, click, launch, wait_drawn, wait_updates
+from tests.client.viewer.browser import blank, click, wait_drawn, wait_updates
 from tests.system.line import run_line
 
 TASK_MAX_MS = 50
 TASK = "ThreadControllerImpl::RunTask"
 
 
-def test_no_task_of_the_page_takes_50_ms_of_its_thread(tmp_path: Path) -> None:
+def test_no_task_of_the_page_takes_50_ms_of_its_thread(browser: Browser, tmp_path: Path) -> None:
     """Time is the processor's, as the browser's own trace has it: what else the machine does is not counted."""
     with ExitStack() as stack, ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
         line = aside.submit(run_line, stack, tmp_path, "--size", "M", "--link-rate", "20000000").result()
-        browser = launch(stack.enter_context(sync_playwright()))
-        stack.callback(browser.close)
         tasks = tasks_ms(browser, line.url)
     assert len(tasks) > 100
     assert max(tasks) < TASK_MAX_MS, sorted(tasks)[-5:]
