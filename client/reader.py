@@ -9,9 +9,9 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 from weakref import WeakSet
 
 from client.errors import NodeLost, RequestRefused
@@ -45,17 +45,6 @@ class Stats:
     apply_s: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Looking:
-    """A look in the air."""
-
-    tally: Tally
-    answer: asyncio.Future[Update]
-
-    def close(self, said: m.Updated, lost: int = 0) -> None:
-        _settle(self.answer, self.tally.close(said, lost))
-
-
 class Reader:
     """Reads a stream from now on. live : the running sweep's frames.  ended : why nothing more comes; None: it does."""
 
@@ -66,8 +55,10 @@ class Reader:
         self._replica: Replica | None = None
         self._request = 0
         self._opening: dict[int, asyncio.Future[Model]] = {}
-        self._looking: dict[int, _Looking] = {}
+        self._looking: dict[int, asyncio.Future[Update]] = {}
         self._enveloping: dict[int, asyncio.Future[m.Enveloped]] = {}
+        self._waiting: tuple[dict[int, asyncio.Future[Any]], ...] = self._opening, self._looking, self._enveloping
+        self._tallies: dict[int, Tally] = {}
         self._news: WeakSet[News] = WeakSet()
         self._refinements = self._samples = self._updates = self._resyncs = 0
         self._apply_s = 0.0
@@ -97,35 +88,23 @@ class Reader:
         self._request += 1
         return self._request
 
-    @contextmanager
-    def opening(self, request: int) -> Iterator[asyncio.Future[Model]]:
+    def opening(self, request: int) -> AbstractContextManager[asyncio.Future[Model]]:
         """While somebody waits for a scan to be open: its model, once the first view is in."""
-        answer: asyncio.Future[Model] = asyncio.get_running_loop().create_future()
-        self._opening[request] = answer
-        try:
-            yield answer
-        finally:
-            self._opening.pop(request, None)
+        return _answer_in(self._opening, request)
 
     @contextmanager
     def looking(self, request: int) -> Iterator[asyncio.Future[Update]]:
         """While somebody waits for the answer to a look."""
-        answer: asyncio.Future[Update] = asyncio.get_running_loop().create_future()
-        self._looking[request] = _Looking(Tally(request), answer)
+        self._tallies[request] = Tally(request)
         try:
-            yield answer
+            with _answer_in(self._looking, request) as answer:
+                yield answer
         finally:
-            self._looking.pop(request, None)
+            del self._tallies[request]
 
-    @contextmanager
-    def enveloping(self, request: int) -> Iterator[asyncio.Future[m.Enveloped]]:
+    def enveloping(self, request: int) -> AbstractContextManager[asyncio.Future[m.Enveloped]]:
         """While somebody waits to hear how far off each block is."""
-        answer: asyncio.Future[m.Enveloped] = asyncio.get_running_loop().create_future()
-        self._enveloping[request] = answer
-        try:
-            yield answer
-        finally:
-            self._enveloping.pop(request, None)
+        return _answer_in(self._enveloping, request)
 
     def is_looking(self, request: int) -> bool:
         """Whether a look is still to be answered."""
@@ -181,9 +160,9 @@ class Reader:
                 raise NodeLost(f"{self._stream.url} ended the stream: {reason}")
 
     async def _refine(self, refinement: Refinement, size: int) -> None:
-        replica, look = self._bound(), self._looking.get(refinement.look)
-        if look is not None:
-            look.tally.bytes_received += size
+        replica, tally = self._bound(), self._tallies.get(refinement.look)
+        if tally is not None:
+            tally.bytes_received += size
         self._applying = asyncio.get_running_loop().run_in_executor(None, replica.apply, refinement)
         applied = await asyncio.shield(self._applying)
         if applied is None:
@@ -192,8 +171,8 @@ class Reader:
         self._refinements += 1
         self._samples += refinement.samples
         self._apply_s += applied.apply_s
-        if look is not None:
-            look.tally.add(refinement, applied)
+        if tally is not None:
+            tally.add(refinement, applied)
         if refinement.generator is Generator.COARSE and replica.model.complete:
             await self._first_view(replica)
 
@@ -206,7 +185,7 @@ class Reader:
         self._check_asked(opened.request)
         self._replica = Replica(opened)
         for older in [request for request in self._looking if request < opened.request]:
-            self._looking.pop(older).close(m.Updated(older, 0, "superseded"))
+            self._close(m.Updated(older, 0, "superseded"))
 
     async def _answer(self, updated: m.Updated, size: int) -> None:
         self._check_asked(updated.request)
@@ -214,9 +193,9 @@ class Reader:
         superseded = updated.reason == "superseded"  # may overtake the update in the air, so it says nothing of order
         lost = 0 if superseded else replica.missing(updated)
         self._updates += 1
-        if (look := self._looking.pop(updated.request, None)) is not None:
-            look.tally.bytes_received += size
-            look.close(updated, lost)
+        if updated.request in self._looking:
+            self._tallies[updated.request].bytes_received += size
+            self._close(updated, lost)
         if lost:
             await self._state(replica.object())
         elif not superseded:
@@ -227,32 +206,29 @@ class Reader:
             self._resyncs += 1
             await self._stream.send(state)
 
+    def _close(self, updated: m.Updated, lost: int = 0) -> None:
+        """Answer a look."""
+        _settle(self._looking.pop(updated.request), self._tallies[updated.request].close(updated, lost))
+
     def _refuse(self, refused: m.Refused) -> None:
         error = RequestRefused(refused.code, refused.message)
-        if (look := self._looking.pop(refused.request, None)) is not None:
-            _settle(look.answer, error)
-        elif (opening := self._opening.pop(refused.request, None)) is not None:
-            _settle(opening, error)
-        elif (asked := self._enveloping.pop(refused.request, None)) is not None:
-            _settle(asked, error)
-        else:
-            log.warning("%s, about request %d, which nobody waits for", error, refused.request)
+        for waiting in self._waiting:
+            if (answer := waiting.pop(refused.request, None)) is not None:
+                _settle(answer, error)
+                return
+        log.warning("%s, about request %d, which nobody waits for", error, refused.request)
 
     def _end(self, cause: Exception, on_purpose: bool = False) -> None:
-        if self.ended is None:
-            self.ended = cause
-            for opening in self._opening.values():
-                _settle(opening, cause)
-            for look in self._looking.values():
-                _settle(look.answer, cause)
-            for asked in self._enveloping.values():
-                _settle(asked, cause)
-            self._enveloping.clear()
-            self._opening.clear()
-            self._looking.clear()
-            for news in list(self._news):
-                news.end(None if on_purpose else cause)
-            self.live.end(None if on_purpose else cause)
+        if self.ended is not None:
+            return
+        self.ended = cause
+        for waiting in self._waiting:
+            for answer in waiting.values():
+                _settle(answer, cause)
+            waiting.clear()
+        for news in list(self._news):
+            news.end(None if on_purpose else cause)
+        self.live.end(None if on_purpose else cause)
 
     def _check_asked(self, request: int) -> None:
         if not 0 < request <= self._request:
@@ -262,6 +238,17 @@ class Reader:
         if self._replica is None:
             raise RemoteWireError("the node speaks of a scan before one is open")
         return self._replica
+
+
+@contextmanager
+def _answer_in(waiting: dict[int, asyncio.Future[Answer]], request: int) -> Iterator[asyncio.Future[Answer]]:
+    """A place for the answer to a request, for as long as somebody waits for it."""
+    answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+    waiting[request] = answer
+    try:
+        yield answer
+    finally:
+        waiting.pop(request, None)
 
 
 def _settle(answer: asyncio.Future[Answer], value: Answer | Exception) -> None:

@@ -185,24 +185,11 @@ class Session:
             raise LocalWireError(f"look: the scan is open with the {bound} profile, not {profile!r}: open it anew")
         classic = bound == "classic"
         request = self._reader.new_request()
-        look = _checked_look(
-            m.Look(
-                request,
-                u,
-                v,
-                window,
-                texture_db,
-                range_mm,
-                max_wait_s,
-                max_bytes,
-                fill,
-                alpha,
-                scale,
-                bound,
-                None if classic else parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
-                parameters if classic else None,  # type: ignore[arg-type]  # likewise
-            )
-        )
+        look = _checked_look(m.Look(
+            request, u, v, window, texture_db, range_mm, max_wait_s, max_bytes, fill, alpha, scale, bound,
+            None if classic else parameters,  # type: ignore[arg-type]  # a mapping is converted by the check
+            parameters if classic else None,  # type: ignore[arg-type]  # likewise
+        ))  # fmt: skip
         with self._reader.looking(request) as answer:
             try:
                 await self._send(look)

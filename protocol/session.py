@@ -8,8 +8,8 @@ the two roles test each other.
     new       serverInfo -> greeted                            -
     greeted   refused, goodbye -> closed                       hello -> waiting
     waiting   welcome -> ready, refused, goodbye -> closed     -
-    ready     opened, updated, resync, published, refused,     open, look, ack, state, cancel, watch
-              refinements, goodbye -> closed,
+    ready     opened, updated, resync, published, refused,     open, look, ack, state, cancel, watch,
+              enveloped, refinements, goodbye -> closed,       envelope
               liveStarted, liveProgress, liveEnded, live columns
     closed    -                                                -
 """
