@@ -158,8 +158,11 @@ def read_surface(path: Path, placing: Placing | None = None) -> Grid | Mesh:
 
 
 def joined(*notes: str) -> str:
-    """Notes one behind the other."""
-    return ". ".join(note for note in notes if note)
+    """Notes one behind the other. Where they are too long for a scan, the older ones lose their beginning."""
+    from exchange.native import NOTE_MAX
+
+    text = ". ".join(note for note in notes if note)
+    return text if len(text) <= NOTE_MAX else f"... {text[4 - NOTE_MAX :]}"
 
 
 def _read_mesh(

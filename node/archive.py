@@ -25,7 +25,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from node.durable import disk_error, require_room, sync_folder, write_whole
+from node.durable import decode_kept, disk_error, require_room, sync_folder, write_whole
 from node.library_folder import CHECKED, RESTORE, move_in
 from node.scan_folder import (
     ARRAY_HEADER_BYTES_MAX,
@@ -225,10 +225,7 @@ def _unpack(reader: _TarReader, staged: Path) -> list[str]:
 
 
 def _decode_mark(data: bytes) -> _Mark:
-    try:
-        mark = msgspec.json.decode(data, type=_Mark)
-    except msgspec.DecodeError as error:
-        raise LibraryError(f"not a sound backup: {MARK}: {error}") from error
+    mark = decode_kept(data, _Mark, f"the backup: its {MARK}")
     if mark.format != FORMAT:
         raise LibraryError(f"the backup has format {mark.format}, this version knows {FORMAT} only")
     if not 0 <= mark.scans <= SCANS_MAX:

@@ -6,11 +6,15 @@ import errno
 import os
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
+
+import msgspec
 
 from protocol.errors import LibraryError
 
 NEW = ".new"
 EASY_BYTES = 1 << 30  # with less left, a disk is nearly full
+Kept = TypeVar("Kept")
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -52,6 +56,14 @@ def read_bounded(path: Path, bytes_max: int) -> bytes:
     if len(data) > bytes_max:
         raise LibraryError(f"its {path.name} is larger than {bytes_max} bytes")
     return data
+
+
+def decode_kept(data: bytes, kind: type[Kept], what: str) -> Kept:
+    """The JSON of a small file of ours. what : it is, for the message. Raises LibraryError for one that has rotted."""
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise LibraryError(f"{what} is damaged: {error}") from error
 
 
 def sync_folder(folder: Path) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 
-from node.durable import NEW, disk_error, read_bounded, sync_folder, write_whole
+from node.durable import NEW, decode_kept, disk_error, read_bounded, sync_folder, write_whole
 from node.scan_folder import INCOMING, RANGE_FILE, RECORD_FILE, REPAIRS_FILE, SCAN_ID, TEXTURE_FILE
 from node.sidecar import FILE as SIDECAR_FILE
 from protocol.errors import LibraryError
@@ -66,13 +66,12 @@ class Lock:
 def check_format(folder: Path) -> None:
     """Raises LibraryError when a library was written by a version that knows more; nothing is touched."""
     try:
-        mark = msgspec.json.decode(read_bounded(folder / MARK_FILE, _MARK_BYTES_MAX), type=_Mark)
+        data = read_bounded(folder / MARK_FILE, _MARK_BYTES_MAX)
     except FileNotFoundError:
         return  # empty, or not a library yet
     except OSError as error:
         raise disk_error(f"the library {folder} cannot be used", error) from error
-    except msgspec.DecodeError as error:
-        raise LibraryError(f"the library {folder} cannot be used: its {MARK_FILE} is damaged: {error}") from error
+    mark = decode_kept(data, _Mark, f"the library {folder} cannot be used: its {MARK_FILE}")
     if mark.format != FORMAT:
         raise LibraryError(f"the library {folder} has format {mark.format}, this version knows {FORMAT} only")
 

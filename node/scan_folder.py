@@ -24,9 +24,10 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+from numpy.lib.format import open_memmap
 
 from exchange.native import NOTE_MAX
-from node.durable import read_bounded, sync_folder, write_whole
+from node.durable import decode_kept, read_bounded, sync_folder, write_whole
 from node.scan_quality import ScanQuality
 from protocol.errors import LibraryError
 from protocol.grid import Grid, GridSpec, ImageArray, RepairArray, StepArray, no_repairs
@@ -135,19 +136,16 @@ def read_record(folder: Path) -> Record:
 
 def decode_record(data: bytes) -> Record:
     """The content of scan.json. Raises LibraryError."""
-    try:
-        if msgspec.json.decode(data, type=_Version).format != FORMAT:
-            raise LibraryError("written in a format that this version does not know")
-        return msgspec.json.decode(data, type=Record)
-    except msgspec.DecodeError as error:
-        raise LibraryError(f"its {RECORD_FILE} is damaged: {error}") from error
+    what = f"its {RECORD_FILE}"
+    if decode_kept(data, _Version, what).format != FORMAT:
+        raise LibraryError("written in a format that this version does not know")
+    return decode_kept(data, Record, what)
 
 
 def read_grid(folder: Path, spec: GridSpec) -> Grid:
     """A scan's samples, mapped read-only. Raises LibraryError when they are not what its geometry says."""
     try:
-        range_steps = np.load(folder / RANGE_FILE, mmap_mode="r", allow_pickle=False)
-        texture = np.load(folder / TEXTURE_FILE, mmap_mode="r", allow_pickle=False)
+        range_steps, texture = open_memmap(folder / RANGE_FILE, mode="r"), open_memmap(folder / TEXTURE_FILE, mode="r")
         return Grid(spec, range_steps, texture, _read_repairs(folder / REPAIRS_FILE))
     except (OSError, ValueError, EOFError) as error:
         raise LibraryError(f"its samples cannot be read: {error}") from error
@@ -157,7 +155,7 @@ def _read_repairs(path: Path) -> RepairArray:
     """Raises OSError, ValueError, EOFError."""
     if not path.exists():
         return no_repairs()
-    repairs: RepairArray = np.load(path, mmap_mode="r", allow_pickle=False)
+    repairs: RepairArray = open_memmap(path, mode="r")
     return repairs
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from node.durable import disk_error, read_bounded, write_whole
+from node.durable import decode_kept, disk_error, read_bounded, write_whole
 from protocol.errors import LibraryError
 
 FORMAT = 1
@@ -93,7 +93,7 @@ def decode_changes(data: bytes) -> Changes:
         raise ValueError(f"changes of {len(data)} bytes, at most {CHANGE_BYTES_MAX} are taken")
     try:
         return msgspec.json.decode(data, type=Changes)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeError) as error:
         raise ValueError(str(error)) from error
 
 
@@ -159,12 +159,10 @@ def _encode(history: tuple[Change, ...]) -> bytes:
 
 
 def _decode(data: bytes) -> tuple[Change, ...]:
-    try:
-        if msgspec.json.decode(data, type=_Version).format != FORMAT:
-            raise LibraryError(f"its {FILE} is written in a format that this version does not know")
-        file = msgspec.json.decode(data, type=_File)
-        if hashlib.sha256(file.history).hexdigest() != file.sha256:
-            raise LibraryError(f"its {FILE} is damaged: it is not what was written")
-        return msgspec.json.decode(file.history, type=tuple[Change, ...])
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise LibraryError(f"its {FILE} is damaged: {error}") from error
+    what = f"its {FILE}"
+    if decode_kept(data, _Version, what).format != FORMAT:
+        raise LibraryError(f"{what} is written in a format that this version does not know")
+    file = decode_kept(data, _File, what)
+    if hashlib.sha256(file.history).hexdigest() != file.sha256:
+        raise LibraryError(f"{what} is damaged: it is not what was written")
+    return decode_kept(bytes(file.history), tuple[Change, ...], what)

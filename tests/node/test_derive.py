@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from exchange.closing import close_scan, closes
-from exchange.native import read_native
+from exchange.native import NOTE_MAX, read_native
 from node import derive
 from node.library import About, Library, content_id
 from node.serve import NodeServer
@@ -55,6 +55,13 @@ async def test_a_sphere_is_a_scan_of_its_own_that_says_where_it_comes_from(tmp_p
         assert [listed[scan]["geometry"] for scan in (ball, said["id"])] == ["cylinder", "sphere"]
         assert (listed[said["id"]]["source"], listed[said["id"]]["name"]) == ("derived", "thing")
         assert library.open(ball).about.made_from == ()
+
+
+async def test_what_has_a_long_note_can_be_derived_and_the_newest_of_it_is_kept(tmp_path: Path) -> None:
+    async with node(tmp_path) as (client, _, library, _):
+        can = library.add(CAN, About(1e9, note="x" * NOTE_MAX)).id
+        said = await derived(client, can, geometry="sphere", caps=True)
+        assert len(said["note"]) == NOTE_MAX and said["note"].startswith("... xx") and "made up" in said["note"]
 
 
 async def test_what_is_made_up_is_said_and_stays_said(tmp_path: Path) -> None:

@@ -169,8 +169,12 @@ def answering(body: bytes) -> HTTPServer:
 
 
 @pytest.mark.parametrize(
-    ("body", "state"), [(b'{"status": "ready", "capture": {}}', "ok"), (b"<html>", "problem"), (b"[]", "problem")]
-)
+    ("body", "state"),
+    [
+        (b'{"status": "ready", "capture": {}}', "ok"), (b"<html>", "problem"), (b"[]", "problem"),
+        (b'{"\xff"', "problem"),
+    ],
+)  # fmt: skip
 def test_a_node_at_its_address_is_fine_another_program_is_not(body: bytes, state: str) -> None:
     with answering(body) as other:
         thread = Thread(target=other.handle_request)

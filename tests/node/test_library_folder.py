@@ -2,6 +2,7 @@
 
 import json
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from node.library import Library, survey, verify
 from protocol.errors import LibraryError
-from tests.node.library_cases import ABOUT, entries, files_in, noise, reopened
+from tests.node.library_cases import ABOUT, SPEC, entries, files_in, noise, reopened
 
 
 def _cut_range(folder: Path) -> None:
@@ -26,6 +27,11 @@ def _lose_record(folder: Path) -> None:
 
 def _garble_record(folder: Path) -> None:
     (folder / "scan.json").write_bytes(b'{"format": 1, \xff')
+
+
+def _rot_in_a_text(folder: Path) -> None:
+    record = (folder / "scan.json").read_bytes()
+    (folder / "scan.json").write_bytes(record.replace(b'"sweep"', b'"swe\xe5p"'))
 
 
 def _bloat_record(folder: Path) -> None:
@@ -61,6 +67,7 @@ def _rename_folder(folder: Path) -> None:
         (_lose_texture, "texture.npy cannot be read: No such file"),
         (_lose_record, "scan.json cannot be read: No such file"),
         (_garble_record, "scan.json is damaged"),
+        (_rot_in_a_text, "scan.json is damaged"),
         (_bloat_record, "scan.json is larger than 65536 bytes"),
         (_write_as_newer, "written in a format that this version does not know"),
         (_claim_another_id, "scan.json belongs to scan '000"),
@@ -103,6 +110,19 @@ def test_a_rotten_byte_is_found_when_the_scan_is_opened(tmp_path: Path, file: st
         library.add(noise(0), ABOUT)
     assert path.read_bytes() == data
     assert len(entries(tmp_path)) == 1
+
+
+def test_an_archive_in_the_place_of_an_array_is_refused(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    scan_id = library.add(noise(0), ABOUT).id
+    path = tmp_path / scan_id / "range.npy"
+    size_bytes = path.stat().st_size
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("range.npy", bytes(size_bytes - 120))
+    assert 2 * SPEC.width * SPEC.height < path.stat().st_size
+    library = reopened(library)
+    with pytest.raises(LibraryError, match="is damaged"):
+        library.open(scan_id)
 
 
 def test_foreign_things_are_reported_and_left_alone(tmp_path: Path) -> None:
@@ -165,7 +185,7 @@ def test_a_library_of_a_newer_version_is_refused_untouched(tmp_path: Path) -> No
     assert (tmp_path / ".incoming-x1").exists()
 
 
-@pytest.mark.parametrize("mark", [b"", b"{}", b'{"format": "x"}', b" " * 5000, b"\xff"])
+@pytest.mark.parametrize("mark", [b"", b"{}", b'{"format": "x"}', b'{"format": "\xff"}', b" " * 5000, b"\xff"])
 def test_a_library_with_a_damaged_mark_is_refused(tmp_path: Path, mark: bytes) -> None:
     (tmp_path / "library.json").write_bytes(mark)
     with pytest.raises(LibraryError):
