@@ -31,7 +31,7 @@ from protocol.errors import PortLost
 from protocol.framing import USB_PAYLOAD_MAX
 
 SCANNER_IDS = ((0x1209, 0x5CA1),)
-USB_WINDOW_BYTES = 1 << 20
+USB_WINDOW_BYTES = 4 << 20
 _BY_ID = Path("/dev/serial/by-id")
 _LOOKED_AT = ("/dev/serial/by-id", "/dev/bus/usb", "/dev")
 _POLL_S = 0.25

@@ -24,7 +24,7 @@ from drivers.address import parse_ids
 from protocol.errors import PortLost
 
 READ_BYTES = 262_144
-_WAITING_BYTES_MAX = 4 * READ_BYTES
+_WAITING_BYTES_MAX = 16 * READ_BYTES  # a tenth of a second at full speed: no longer is our thread kept waiting
 _GATHER_S = 0.008  # what follows on a piece of a sweep within this time is taken with it: fewer wake-ups
 _GATHER_FROM_BYTES = 16384  # less is an answer, which somebody waits for
 _READ_MS = 100  # how long a thread that shall end may go on waiting

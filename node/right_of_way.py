@@ -1,8 +1,8 @@
 """A sweep on a fast line goes first: what is computed for clients waits while columns come.
 
 All threads share one interpreter. Columns at the full speed of USB need it a hundred times between two moments at which
-a thread that plans an update would let go of it, so while they come, updates are made one at a time, with pauses. On a
-serial line nothing ever waits.
+a thread that plans an update would let go of it, so while they come, updates are made one at a time, with pauses in
+which the capture thread makes good what it was kept from. On a serial line nothing ever waits.
 """
 
 from __future__ import annotations
@@ -12,12 +12,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from drivers.scanner import SweepEvent
+from drivers.scanner import SweepEvent, SweepFinished, SweepInterrupted
 from protocol.scanner_messages import RangeColumn, TextureColumn
+
+_COLUMNS = (RangeColumn, TextureColumn)
 
 FAST_BYTES_S = 4e6
 PORTION_BYTES = 1 << 18
-WAIT_S = 0.25  # nobody waits longer for the columns: clients go on seeing something
+STILL_S = 0.25  # a fast sweep that brings nothing for longer takes the way no more
+WAIT_S = 0.25
+REST = 3.0  # a pause is at least that many times as long as what was computed before it
+WAIT_MAX_S = 1.0  # nobody waits longer for the columns: clients go on seeing something
 LOOK_S = 0.01
 
 
@@ -28,20 +33,25 @@ class RightOfWay:
         self._clock = clock
         self._since_s = 0.0
         self._bytes = 0
+        self._is_fast = False
         self._taken_until_s = 0.0
+        self._rest_until_s = 0.0
         self._one = threading.Lock()
 
     def watch(self, event: SweepEvent) -> None:
         """Take in what happens in a sweep; for the capture thread."""
-        if not isinstance(event, RangeColumn | TextureColumn):
-            return
-        self._bytes += len(event.data)
-        if self._bytes < PORTION_BYTES:
-            return
-        now_s = self._clock()
-        took_s = now_s - self._since_s
-        if took_s * FAST_BYTES_S < self._bytes:
-            self._taken_until_s = now_s + PORTION_BYTES / FAST_BYTES_S
+        if isinstance(event, _COLUMNS):
+            self._bytes += len(event.data)
+            if self._bytes >= PORTION_BYTES:
+                self._measure(self._clock())
+        elif isinstance(event, SweepFinished | SweepInterrupted):
+            self._is_fast, self._taken_until_s = False, 0.0
+
+    def _measure(self, now_s: float) -> None:
+        """Another portion has come. A sweep that was fast once counts as fast to its end: it may be we who slow it."""
+        self._is_fast |= (now_s - self._since_s) * FAST_BYTES_S < self._bytes
+        if self._is_fast:
+            self._taken_until_s = now_s + STILL_S
         self._since_s, self._bytes = now_s, 0
 
     @property
@@ -56,7 +66,11 @@ class RightOfWay:
             yield
             return
         with self._one:
-            until_s = self._clock() + WAIT_S
+            began_s = self._clock()
+            until_s = min(max(began_s + WAIT_S, self._rest_until_s), began_s + WAIT_MAX_S)
             while self.is_taken and self._clock() < until_s:
                 time.sleep(LOOK_S)
+            began_s = self._clock()
             yield
+            now_s = self._clock()
+            self._rest_until_s = now_s + REST * (now_s - began_s)

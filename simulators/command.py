@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 BITS_PER_BYTE = 10  # on a serial line: start, eight data, stop
 BAUD = 3_000_000
 USB_BYTES_S = 35e6
-USB_PORTION_BYTES = 65536
+USB_PORTION_BYTES = 253_000  # with a column more it fills one read of the node, as a device that has more to send does
 SPECIMEN_HELP = "head, nutcracker, sphere, cylinder, pebble, or a .npz grid, mesh or Echo file (head)"
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,9 +35,10 @@ GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType
     }
 )
 ON_COLUMN = 1e-6
+Samples = TypeVar("Samples", StepArray, ImageArray)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Specimen:
     """An object with known truth. Its arrays are made read-only: nobody can change the truth while it is scanned.
 
@@ -56,19 +59,33 @@ class Specimen:
 
         Between two measured samples the range is interpolated; where either is void the nearer one decides.
         """
-        spec, steps = self.grid.spec, self.grid.range_steps
+        spec, columns = self.grid.spec, self._range_columns
         left, right, weight = _columns_about(angle_rad, spec.theta0_rad, spec.width)
-        before, after = steps[:, left], steps[:, right]
+        before, after = columns[left], columns[right]
+        if not weight:
+            return before
         nearer = after if weight > 0.5 else before
         mixed = np.rint(before + weight * (after.astype(np.float64) - before))
         return np.where((before != VOID) & (after != VOID), mixed, nearer).astype(np.uint16)
 
     def texture_column(self, angle_rad: float) -> ImageArray:
         """Colour seen at an angle, interpolated. (Ht, 3) uint8 RGB"""
-        spec, texture = self.grid.spec, self.grid.texture
+        spec, columns = self.grid.spec, self._texture_columns
         left, right, weight = _columns_about(angle_rad, spec.theta0_rad, spec.texture_width)
-        before, after = texture[:, left], texture[:, right]
+        before, after = columns[left], columns[right]
+        if not weight:
+            return before
         return np.rint(before + weight * (after.astype(np.float64) - before)).astype(np.uint8)
+
+    @cached_property
+    def _range_columns(self) -> list[StepArray]:
+        """The columns, each with its samples side by side: a sweep asks for one after the other."""
+        return list(_by_column(self.grid.range_steps))
+
+    @cached_property
+    def _texture_columns(self) -> list[ImageArray]:
+        """Likewise."""
+        return list(_by_column(self.grid.texture))
 
 
 def make_specimen(
@@ -103,6 +120,13 @@ def _from_file(path: Path, size: str, texture_path: Path | None) -> Specimen:
 def _standing(name: str, grid: Grid) -> Specimen:
     """A grid as a specimen: of a closed object the turntable sees the sides."""
     return Specimen(name, grid) if grid.spec.geometry == "cylinder" else Specimen(name, unroll(grid), grid)
+
+
+def _by_column(rows: Samples) -> Samples:
+    """(W, H, ...) of (H, W, ...), read-only."""
+    columns: Samples = np.ascontiguousarray(np.swapaxes(rows, 0, 1))
+    columns.flags.writeable = False
+    return columns
 
 
 def _columns_about(angle_rad: float, theta0_rad: float, width: int) -> tuple[int, int, float]:

@@ -18,7 +18,7 @@ from protocol.scanner_messages import (
 )
 from simulators.turntable import Exposure, Turntable
 
-_OUTBOX_COLUMNS = 16
+_OUTBOX_COLUMNS = 64
 _TURN_COLUMNS = 1 << 16
 _COARSEST = 16  # columns apart, in the first portion of a buffered sweep
 _COLUMN_OF: dict[Channel, type[RangeColumn] | type[TextureColumn]] = {

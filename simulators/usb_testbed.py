@@ -98,6 +98,7 @@ class UsbTestbed:
         self.identity = identity or UsbIdentity()
         self.name = self.identity.address
         self.stalls = 0  # transfers that the device will refuse next
+        self.waited_s = 0.0  # for the node to fetch what the device has to send
         self._root = root
         self._rate_bytes_s = rate_bytes_s
         self._free_s = 0.0
@@ -130,7 +131,9 @@ class UsbTestbed:
         if not data:
             return
         with self._changed:
+            began_s = time.monotonic()
             self._changed.wait_for(lambda: self._waiting_bytes() < _OUT_WAITING_BYTES or self._is_cancelled)
+            self.waited_s += time.monotonic() - began_s
             self._out.append(memoryview(data))
             self._fill()
         self._pace(len(data))

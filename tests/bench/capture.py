@@ -3,6 +3,10 @@
 Scanner, node, clients and driver are processes of their own. USB is emulated under umockdev's preload, whose work
 counts as the node's. Durations are the scanner's own: from the first column to the last. Compared are sweeps of one
 run, taken in turn; a figure is a median.
+
+Processor time tells more than the clock on a machine that others use, too: it is given as a share of a core, of the
+node and of the scanner's process each, and for the node also as the share that the full speed of the link would take.
+Whether a node slows a sweep shows best in how long it kept the scanner waiting: for credit, or to fetch what it sends.
 """
 
 from __future__ import annotations
@@ -33,9 +37,11 @@ ROOT = Path(__file__).parents[2]
 DRIVER_BYTES = 256_000_000
 AWAY_S = 0.6
 PASSES = 4  # of M over USB: long enough to be measured
+UNPACED = float("inf")
 POLL_S = 0.1
 SETTLED_S = 1.0
-WINDOW_S = 2.0  # in the middle of a sweep, in which the node is asked nothing
+BEGIN_S, WINDOW_S, UNPACED_WINDOW_S = 0.5, 2.0, 1.0  # of a sweep; in between the node is asked nothing
+UNPACED_PASSES = 8
 
 
 @dataclass
@@ -59,7 +65,9 @@ def run(repeats: int) -> dict[str, Any]:
         "clients": CLIENTS,
         "serial": sweeps("pty", "S", SERIAL_BYTES_S, 1, repeats),
         "usb": sweeps("usb", "M", USB_BYTES_S, PASSES, repeats),
+        "unpaced": unpaced(repeats),
         "driver": {str(portion): driver(portion, repeats) for portion in (1 << 16, 1 << 18)},
+        "driver_paced": driver(1 << 16, repeats, USB_BYTES_S),
         "recovery_s": recovery(repeats),
         "assembly": assembly(repeats),
     }
@@ -83,14 +91,32 @@ def sweeps(link: str, size: str, rate_bytes_s: float, passes: int, repeats: int)
     }  # fmt: skip
 
 
-def sweep(running: Line) -> dict[str, Any]:
+def unpaced(repeats: int) -> dict[str, float]:
+    """The whole way of a column, from USB to journal and assembler, as fast as scanner and node can."""
+    with line("usb", "M", UNPACED, UNPACED_PASSES) as running:
+        sweep(running, UNPACED_WINDOW_S)  # the scanner then has its columns at hand
+        swept = [sweep(running, UNPACED_WINDOW_S) for _ in range(repeats)]
+    return {**_medians(swept), "lost_columns": sum(sweep["lost_columns"] for sweep in swept)}
+
+
+def sweep(running: Line, window_s: float = WINDOW_S) -> dict[str, Any]:
     """One sweep: what the scanner said of it, and what the node took for it."""
-    cpu, lost = asyncio.run(_sweep(running))
+    core, lost = asyncio.run(_sweep(running, window_s))
     said = json.loads(running.said.readline())
-    return {**said, "mb_s": said["bytes"] / MEGABYTE / said["seconds"], "core": cpu, "lost_columns": lost}
+    mb_s = said["bytes"] / MEGABYTE / said["seconds"]
+    return {
+        "seconds": said["seconds"],
+        "bytes": said["bytes"],
+        "mb_s": mb_s,
+        "core": core,
+        "cpu_s_per_mb": core / mb_s,
+        "scanner_core": said["cpu_s"] / said["seconds"],
+        "waiting": said["stood_s"] / said["seconds"],
+        "lost_columns": lost,
+    }
 
 
-async def _sweep(running: Line) -> tuple[float, int]:
+async def _sweep(running: Line, window_s: float) -> tuple[float, int]:
     """The node's share of a core while columns came, and how many it had to ask for again."""
     from client import connect
 
@@ -98,10 +124,11 @@ async def _sweep(running: Line) -> tuple[float, int]:
         published = session.published()
         while (await session.scanner())["phase"] != "ready":
             await asyncio.sleep(POLL_S)
+        await asyncio.sleep(SETTLED_S)  # the node looks a new scan over
         await session.start_sweep()
-        await asyncio.sleep(SETTLED_S / 2)
+        await asyncio.sleep(BEGIN_S)
         first = time.monotonic(), _cpu_s(running.pid)
-        await asyncio.sleep(WINDOW_S)
+        await asyncio.sleep(window_s)
         last = time.monotonic(), _cpu_s(running.pid)
         assert (await session.scanner())["phase"] == "sweeping"
         quality = await session.quality(await anext(published))
@@ -109,14 +136,15 @@ async def _sweep(running: Line) -> tuple[float, int]:
     return (last[1] - first[1]) / (last[0] - first[0]), quality.requested_columns
 
 
-def driver(portion_bytes: int, repeats: int) -> dict[str, float]:
-    """The USB driver alone on the real libusb, as fast as the emulation gives: MB/s, and its share of a core."""
+def driver(portion_bytes: int, repeats: int, rate_bytes_s: float = UNPACED) -> dict[str, float]:
+    """The USB driver alone on the real libusb: MB/s, and its share of a core, the emulation's work included."""
     from simulators.usb_testbed import UsbTestbed
 
     data = bytes(portion_bytes)
     rates, shares = [], []
     for _ in range(repeats):
-        with tempfile.TemporaryDirectory(prefix="fs-") as folder, closing(UsbTestbed(Path(folder))) as bed:
+        with tempfile.TemporaryDirectory(prefix="fs-") as folder, ExitStack() as stack:
+            bed = stack.enter_context(closing(UsbTestbed(Path(folder), rate_bytes_s=rate_bytes_s)))
             with worker("read", bed.name, str(DRIVER_BYTES), environment=bed.environment) as said:
                 bed.read(1 << 16, 30)
                 sending = threading.Thread(target=_flood, args=(bed, data))
@@ -211,6 +239,7 @@ def assembly(repeats: int) -> dict[str, float]:
             told.append(json.loads(said.readline()))
     return {
         "seconds": median(one["seconds"] for one in told),
+        "cpu_s": median(one["cpu_s"] for one in told),
         "times_arrays": median(one["peak_bytes"] / one["arrays_bytes"] for one in told),
     }
 
@@ -265,26 +294,40 @@ def _cpu_s(pid: int) -> float:
 
 
 def _medians(swept: list[dict[str, Any]]) -> dict[str, float]:
-    return {name: median(one[name] for one in swept) for name in ("seconds", "mb_s", "core")}
+    names = ("seconds", "mb_s", "core", "cpu_s_per_mb", "scanner_core", "waiting")
+    return {name: median(one[name] for one in swept) for name in names}
 
 
 def told(record: dict[str, Any]) -> str:
     """The figures as text."""
     lines = [f"medians of {record['repeats']}; {record['clients']} clients looking as fast as they can"]
     for name in ("serial", "usb"):
-        found = record[name]
-        alone, beside = found["alone"], found["beside_clients"]
-        lines.append(
-            f"{name}, {found['size']}: {alone['mb_s']:.2f} MB/s of {found['rate_aimed_at'] / MEGABYTE:.2f} at"
-            f" {100 * alone['core']:.1f} % of a core; beside clients {beside['mb_s']:.2f} MB/s,"
-            f" {100 * found['slower']:+.1f} % in time ({found['updates']} updates);"
-            f" {found['lost_columns']} columns lost"
-        )
+        found, alone, beside = record[name], record[name]["alone"], record[name]["beside_clients"]
+        rate = found["rate_aimed_at"] / MEGABYTE
+        lines += [
+            f"{name}, {found['size']}: {alone['mb_s']:.2f} MB/s of {rate:.2f}; {_shares(alone)};"
+            f" at {rate:.2f} MB/s {_percent(alone['cpu_s_per_mb'] * rate)} of a core",
+            f"{name} beside clients: {beside['mb_s']:.2f} MB/s, {100 * found['slower']:+.1f} % in time"
+            f" ({found['updates']} updates); {_percent(beside['waiting'])} of it the scanner waited for the node,"
+            f" alone {_percent(alone['waiting'])}; {found['lost_columns']} columns lost",
+        ]
+    free = record["unpaced"]
+    lines.append(f"USB unpaced, whole capture: {free['mb_s']:.0f} MB/s; {_shares(free)}; {free['lost_columns']} lost")
     for portion, found in record["driver"].items():
-        share = f"{100 * found['core']:.0f} % of a core"
-        lines.append(f"USB driver alone, writes of {portion} bytes: {found['mb_s']:.0f} MB/s, {share}")
+        share = f"{_percent(found['core'])} of a core"
+        lines.append(f"USB driver alone, unpaced, writes of {portion} bytes: {found['mb_s']:.0f} MB/s, {share}")
+    paced = record["driver_paced"]
+    lines.append(f"USB driver alone, paced: {paced['mb_s']:.0f} MB/s, {_percent(paced['core'])} of a core")
     lines.append(f"first column after the plug is back: {record['recovery_s']:.2f} s")
     grid = record["assembly"]
-    memory = f"{grid['times_arrays']:.2f} times its arrays"
-    lines.append(f"a grid of L after its last column: {grid['seconds']:.2f} s, {memory}")
+    took = f"{grid['seconds']:.2f} s, {grid['cpu_s']:.2f} s of processor time"
+    lines.append(f"a grid of L after its last column: {took}, {grid['times_arrays']:.2f} times its arrays")
     return "\n".join(lines)
+
+
+def _shares(found: dict[str, float]) -> str:
+    return f"node {_percent(found['core'])}, scanner {_percent(found['scanner_core'])} of a core"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"

@@ -5,7 +5,8 @@ import time
 
 import pytest
 
-from node.right_of_way import FAST_BYTES_S, PORTION_BYTES, WAIT_S, RightOfWay
+from drivers.scanner import SweepEvent, SweepFinished, SweepInterrupted, SweepReport
+from node.right_of_way import FAST_BYTES_S, PORTION_BYTES, REST, STILL_S, WAIT_MAX_S, WAIT_S, RightOfWay
 from protocol.scanner_messages import RangeColumn
 
 COLUMN = RangeColumn(1, 0, 0, 0, 0, 0, bytes(8192))
@@ -31,7 +32,20 @@ def test_columns_go_first_only_where_they_come_fast(rate_bytes_s: float, is_take
     way = RightOfWay(clock)
     pass_columns(way, clock, rate_bytes_s)
     assert way.is_taken == is_taken
-    clock.now_s += 2 * PORTION_BYTES / FAST_BYTES_S
+    clock.now_s += STILL_S
+    assert not way.is_taken
+
+
+@pytest.mark.parametrize("end", [SweepFinished(SweepReport()), SweepInterrupted("stopped", None, SweepReport())])
+def test_a_sweep_that_was_fast_goes_first_to_its_end_however_slow_it_gets(end: SweepEvent) -> None:
+    clock = Clock()
+    way = RightOfWay(clock)
+    pass_columns(way, clock, 35e6)
+    pass_columns(way, clock, 0.5 * FAST_BYTES_S)
+    assert way.is_taken
+    way.watch(end)
+    assert not way.is_taken
+    pass_columns(way, clock, 0.5 * FAST_BYTES_S)
     assert not way.is_taken
 
 
@@ -64,6 +78,22 @@ def test_beside_fast_columns_one_computes_at_a_time_and_after_a_pause(monkeypatc
             last_s = clock.now_s
             assert way._one.locked()
     assert all(WAIT_S <= wait_s < 2 * WAIT_S for wait_s in waited) and clock.now_s > began_s
+
+
+@pytest.mark.parametrize(("took_s", "rests_s"), [(0.2, 0.2 * REST), (5.0, WAIT_MAX_S)])
+def test_a_pause_is_as_long_as_what_was_computed_before_it_asks_for_and_no_longer_than_anybody_waits(
+    took_s: float, rests_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    way = RightOfWay(clock)
+    monkeypatch.setattr(time, "sleep", lambda time_s: pass_columns(way, clock, 35e6))
+    pass_columns(way, clock, 35e6)
+    with way.given():
+        clock.now_s += took_s
+        pass_columns(way, clock, 35e6)
+    began_s = clock.now_s
+    with way.given():
+        assert 0.9 * rests_s < clock.now_s - began_s < rests_s + 0.2
 
 
 def test_whoever_waits_goes_on_when_the_sweep_is_over() -> None:
