@@ -17,7 +17,7 @@ from protocol.errors import PortLost
 from simulators.faults import Unplugged
 
 _READ_BYTES = 65536
-PORTION_BYTES = 4096  # handed to the line at once
+PORTION_BYTES = 3000  # handed to the line at once; with a frame more, a pty takes it whole
 _BITS_PER_BYTE = 10  # start, eight data, stop
 _CATCH_UP_S = 0.02  # a sleep that came back late may be made good up to this
 
@@ -245,7 +245,7 @@ def serve(scanner: Device, port: ServedPort, stop: threading.Event, portion_byte
             scanner.receive_data(data, now_s)
         scanner.step(now_s)
         try:
-            _write(port, scanner.data_to_send(portion_bytes), scanner.portion_bytes or portion_bytes)
+            _write(port, scanner.data_to_send(portion_bytes), scanner.portion_bytes)
         except Unplugged as pulled:
             port.write(pulled.data)
             port.hang_up()
@@ -253,9 +253,10 @@ def serve(scanner: Device, port: ServedPort, stop: threading.Event, portion_byte
             port.plug_in()
 
 
-def _write(port: ServedPort, data: bytes, portion_bytes: int) -> None:
-    for at in range(0, len(data), portion_bytes):
-        port.write(data[at : at + portion_bytes])
+def _write(port: ServedPort, data: bytes, portion_bytes: int | None) -> None:
+    """Whole frames, unless in portions: where this process is kept waiting, its line pauses between frames."""
+    for at in range(0, len(data), portion_bytes or len(data) or 1):
+        port.write(data[at : at + (portion_bytes or len(data))])
 
 
 def _check_free(path: Path) -> None:
