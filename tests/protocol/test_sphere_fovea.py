@@ -24,8 +24,9 @@ from protocol.sphere_fovea import (
     kept_samples,
 )
 
-SHAPE = ChannelShape(Channel.RANGE, 720, 360, 45, 23, True)
-GRID = DirectionGrid(720, 360)
+WIDTH, HEIGHT = 352, 176
+SHAPE = ChannelShape(Channel.RANGE, WIDTH, HEIGHT, 45, 23, True)
+GRID = DirectionGrid(WIDTH, HEIGHT)
 SKIRT = 178145
 places = st.tuples(st.integers(0, POLAR_MAX), st.integers(0, POLAR_MAX))
 
@@ -49,7 +50,7 @@ def test_samples_are_unique_and_among_what_is_delivered(kind: Kind, place: tuple
     assert np.unique(lattice.sample).size == lattice.sample.size
     assert np.isin(lattice.sample, lattice.cells).all()
     assert (np.diff(lattice.cells) > 0).all()
-    assert lattice.cells[0] >= 0 and lattice.cells[-1] < 720 * 360
+    assert lattice.cells[0] >= 0 and lattice.cells[-1] < WIDTH * HEIGHT
     assert set(np.unique(lattice.node)) == set(range(lattice.sample.size))
 
 
@@ -67,7 +68,7 @@ def test_a_sample_keeps_its_value_and_others_lie_between(kind: Kind, place: tupl
 @given(st.sampled_from(Kind), places)
 def test_a_smooth_surface_is_met_wherever_the_fovea_stands(kind: Kind, place: tuple[int, int]) -> None:
     lattice = any_lattice(kind, place)
-    row, column = np.divmod(lattice.cells, 720)
+    row, column = np.divmod(lattice.cells, WIDTH)
     surface = vectors(GRID.theta_v(row), GRID.theta_h(column)) @ np.array([0.3, -0.5, 0.8])
     off = np.abs(lattice.blend(surface[np.searchsorted(lattice.cells, lattice.sample)]) - surface)
     assert off.max() < 0.05
@@ -87,9 +88,9 @@ def test_voids_spread_to_what_hangs_on_them_only() -> None:
 @pytest.mark.parametrize("polar", [0, POLAR_MAX])
 def test_rings_on_a_pole_give_each_quadrant_as_many(polar: int) -> None:  # AT-15
     lattice = build_sphere_lattice(SHAPE, rings(polar, 12345))
-    counts = np.bincount(lattice.sample % 720 // 180, minlength=4)
+    counts = np.bincount(lattice.sample % WIDTH // (WIDTH // 4), minlength=4)
     assert counts.max() - counts.min() <= 1
-    cells = np.bincount(lattice.cells % 720 // 180, minlength=4)
+    cells = np.bincount(lattice.cells % WIDTH // (WIDTH // 4), minlength=4)
     assert cells.max() - cells.min() <= 1
 
 
@@ -98,7 +99,7 @@ def test_rings_on_a_pole_give_each_quadrant_as_many(polar: int) -> None:  # AT-1
 def test_the_papers_lattices_are_sampled_where_it_says(kind: Kind, lattice: Any, polar: int) -> None:  # AT-16
     p, spread = axes(kind, polar, 1 << 29), (Spread(6, 0.5, 20.0), Spread(4, 0.5, 20.0))
     row, column = GRID.snap_unique(*lattice(p.theta_v, p.theta_h, *spread))
-    sampled, said = build_sphere_lattice(SHAPE, p).sample, row * 720 + column
+    sampled, said = build_sphere_lattice(SHAPE, p).sample, row * WIDTH + column
     assert sampled.size == said.size
     if 0 < polar < POLAR_MAX:  # on a pole any column would do
         assert set(sampled.tolist()) == set(said.tolist())
@@ -110,11 +111,11 @@ def test_the_papers_lattices_are_sampled_where_it_says(kind: Kind, lattice: Any,
 
 @given(st.sampled_from(Kind), st.integers(0, POLAR_MAX), st.integers(0, 15))
 def test_a_lattice_turns_with_its_fovea_round_the_axis(kind: Kind, polar: int, sixteenths: int) -> None:
-    columns = 45 * sixteenths
+    columns = WIDTH // 16 * sixteenths
     here = any_lattice(kind, (polar, 0))
     there = any_lattice(kind, (polar, sixteenths << 28))
-    row, column = np.divmod(here.sample, 720)
-    assert set((row * 720 + (column + columns) % 720).tolist()) == set(there.sample.tolist())
+    row, column = np.divmod(here.sample, WIDTH)
+    assert set((row * WIDTH + (column + columns) % WIDTH).tolist()) == set(there.sample.tolist())
 
 
 @given(st.sampled_from(Kind), places, places)

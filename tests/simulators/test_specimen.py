@@ -1,5 +1,7 @@
 """Specimens: truth by formula, truth by column, truth from a file."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,11 @@ from protocol.errors import ConfigError
 from protocol.grid import VOID, Grid, GridSpec
 from simulators import shapes
 from simulators.specimen import GENERATORS, Specimen, make_specimen
+
+
+@cache
+def made(name: str, size: str = "S") -> Grid:
+    return make_specimen(name, size).grid
 
 
 def tiny() -> Specimen:
@@ -63,7 +70,7 @@ def test_the_truth_is_read_only() -> None:
 
 @pytest.mark.parametrize("size", ["S", "M"])
 def test_the_sphere_is_a_sphere(size: str) -> None:
-    grid = make_specimen("sphere", size).grid
+    grid = made("sphere", size)
     z = grid.spec.height_mm(np.arange(grid.spec.height))
     radius = np.hypot(grid.range_mm, z[:, None])
     assert np.nanmax(np.abs(radius - shapes.SPHERE_RADIUS_MM)) < grid.spec.step_mm
@@ -71,13 +78,13 @@ def test_the_sphere_is_a_sphere(size: str) -> None:
 
 
 def test_the_cylinder_is_a_cylinder() -> None:
-    grid = make_specimen("cylinder").grid
+    grid = made("cylinder")
     assert np.allclose(grid.range_mm, shapes.CYLINDER_RADIUS_MM, atol=grid.spec.step_mm / 2)
 
 
 @pytest.mark.parametrize("name", GENERATORS)
 def test_every_specimen_has_the_named_shape_and_repeats_with_its_seed(name: str) -> None:
-    one, two, other = (make_specimen(name, "S", seed=seed).grid for seed in (1, 1, 2))
+    one, two, other = made(name), make_specimen(name, "S").grid, make_specimen(name, "S", seed=2).grid
     spec = one.spec
     assert (spec.width, spec.height, spec.texture_width, spec.texture_height) == SIZES["S"]
     assert np.array_equal(one.range_steps, two.range_steps) and np.array_equal(one.texture, two.texture)
@@ -86,7 +93,7 @@ def test_every_specimen_has_the_named_shape_and_repeats_with_its_seed(name: str)
 
 @pytest.mark.parametrize("name", GENERATORS)
 def test_every_specimen_joins_at_the_seam(name: str) -> None:
-    grid = make_specimen(name).grid
+    grid = made(name)
     for samples in (grid.range_steps.astype(np.int64), grid.texture.astype(np.int64)):
         steps = np.abs(np.diff(np.concatenate([samples, samples[:, :1]], axis=1), axis=1)).mean(axis=0)
         assert steps[-1].max() <= 3 * steps.mean() + 1
@@ -94,7 +101,7 @@ def test_every_specimen_joins_at_the_seam(name: str) -> None:
 
 @pytest.mark.parametrize("name", GENERATORS)
 def test_every_size_shows_the_same_object(name: str) -> None:
-    small, large = (make_specimen(name, size).grid for size in ("S", "M"))
+    small, large = made(name), made(name, "M")
     inner = large.range_mm[5::10, 2::4][:100]
     near = small.range_mm[: len(inner)]
     assert np.nanmedian(np.abs(inner - near)) < 1.0
