@@ -39,6 +39,14 @@ def parameters_in(draw: st.DrawFn, shape: ChannelShape, listed: bool = False) ->
 
 
 @st.composite
+def windows(draw: st.DrawFn) -> tuple[ChannelShape, Parameters]:
+    """Lattices that do not go all round, on grids of whole blocks, so that they may stand elsewhere as well."""
+    whole = shapes().filter(lambda shape: shape.width % shape.block == 0 and shape.width > shape.block)
+    shape = draw(whole)
+    return shape, draw(parameters_in(shape).filter(lambda p: p.blocks_wide < shape.blocks[1]))
+
+
+@st.composite
 def lattices(draw: st.DrawFn, channel: Channel | None = None, listed: bool = False) -> tuple[ChannelShape, Parameters]:
     shape = draw(shapes(channel))
     return shape, draw(parameters_in(shape, listed))
