@@ -108,7 +108,10 @@ def cast_mesh(mesh: Mesh, spec: GridSpec, progress: Progress = lambda share: Non
 
 
 def to_steps(radius_mm: FloatArray, step_mm: float) -> NDArray[np.uint16]:
-    """Ranges as steps. What is nearer to the axis than half a step stays measured, at one step."""
+    """Ranges as steps, same shape. What is nearer to the axis than half a step stays measured, at one step.
+
+    Raises ExchangeError for a range that takes more steps than there are.
+    """
     try:
         return mm_to_steps(np.maximum(radius_mm, step_mm), step_mm)  # NaN stays NaN
     except ValueError as problem:

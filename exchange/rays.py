@@ -34,11 +34,11 @@ class LevelRays(_Columns):
     pitch_mm: float
 
     def row_at(self, out: FloatArray, z: FloatArray) -> FloatArray:
-        """Of places: which row's ray passes through them, in rows and parts of one. [row 0's ray is at 0]"""
+        """Of places (any shape): which row's ray passes through them, in rows and parts of one, row 0's ray at 0."""
         return np.broadcast_to((self.z_max_mm - z) / self.pitch_mm - 0.5, np.broadcast_shapes(out.shape, z.shape))
 
     def from_ray(self, out: FloatArray, z: FloatArray, row: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Of places: how far off a row's ray, and how far along it. [mm]"""
+        """Of places (any shape): how far off a row's ray, and how far along it. [mm]"""
         return z - (self.z_max_mm - (row.astype(np.float64) + 0.5) * self.pitch_mm), out
 
 

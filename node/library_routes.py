@@ -31,33 +31,23 @@ from node.durable import NoRoom
 from node.journal import Interrupted
 from node.library import Library, verify
 from node.partial import write_partial
-from node.sidecar import Conflict, Sidecar, changed_fields, decode_changes
+from node.sidecar import BY_MAX, Conflict, Sidecar, changed_fields, decode_changes
 from node.spool import send, spool
 from protocol.errors import LibraryError
 
 
-def who_asks(request: web.Request) -> str:
-    """How the history calls whoever asks."""
-    return f"{request[LOGIN].name} at {request.remote}"
-
-
 class LibraryRoutes:
-    """The routes above.
-
-    deleted : told the id of each scan that was deleted, in the event loop.  who : how the history calls who asks.
-    """
+    """The routes above. deleted : told the id of each scan that was deleted, in the event loop."""
 
     def __init__(
         self,
         library: Library,
         capture: Capture | None,
         deleted: Callable[[str], object] = lambda scan_id: None,
-        who: Callable[[web.Request], str] = who_asks,
     ) -> None:
         self._library = library
         self._capture = capture
         self._deleted = deleted
-        self._who = who
 
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
@@ -85,7 +75,7 @@ class LibraryRoutes:
         with _explained():
             changes = decode_changes(await request.read())
             request[WHAT] = ", ".join(changed_fields(changes))
-            by = self._who(request)[:100]
+            by = f"{request[LOGIN].name} at {request.remote}"[:BY_MAX]
             return _said(await asyncio.to_thread(self._library.annotate, scan_id, changes, by, revision))
 
     async def _verify(self, request: web.Request) -> web.Response:

@@ -142,7 +142,7 @@ class ClassicLattice:
 
     @property
     def wrapped_columns(self) -> IntArray:
-        """Dense columns inside, as indices."""
+        """Dense columns inside, as indices. (n,) int64"""
         return self.columns % self.shape.width
 
     def places(self) -> tuple[Between, Between]:

@@ -72,18 +72,18 @@ def cartesian_to_view(x: FloatArray, fovea: float, alpha: float, s: float) -> Fl
 
 
 def view_to_cartesian(view: FloatArray, fovea: float, alpha: float, s: float) -> FloatArray:
-    """Inverse of cartesian_to_view."""
+    """Inverse of cartesian_to_view. [source samples, any shape]"""
     offset = np.asarray(view, np.float64) - fovea
     return fovea + np.copysign(view_to_radius(np.abs(offset), alpha, s), offset)
 
 
 def cyclic_offset(x: FloatArray, fovea: float, width: int) -> FloatArray:
-    """Signed offset from the fovea round a cycle of `width`, in [-width/2, width/2)."""
+    """Signed offset (any shape) from the fovea round a cycle of `width`, in [-width/2, width/2)."""
     return _wrapped(np.asarray(x, np.float64) - fovea + width / 2, width) - width / 2
 
 
 def cylinder_to_view(x: FloatArray, fovea: float, width: int, alpha: float, sigma: float) -> FloatArray:
-    """Foveate the cyclic axis: sigma is the share of it that is kept. Returns positions in [0, width).
+    """Foveate the cyclic axis: sigma is the share of it that is kept. Returns positions in [0, width), same shape.
 
     Source: Eqs. (10), (11) with r_max = width/2, the largest cyclic distance.
     """
