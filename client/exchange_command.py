@@ -14,7 +14,7 @@ from client.arguments import add_closing, add_node, chosen_node, number, positiv
 from protocol.printable import printable
 
 if TYPE_CHECKING:
-    from client.transfer import Moved, Sent
+    from client.transfer import Moved, Taken
     from exchange.formats import ReadOptions, Size
     from exchange.native import Scanned
 
@@ -86,7 +86,7 @@ async def _export(args: argparse.Namespace) -> int:
         return await fetch_scan(node, args.scan, args.file, token=args.token, moved=moved)
 
 
-async def _import(args: argparse.Namespace, found: Scanned) -> Sent:
+async def _import(args: argparse.Namespace, found: Scanned) -> Taken:
     import tempfile
 
     from client.transfer import send_scan

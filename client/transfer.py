@@ -18,6 +18,7 @@ from exchange.whole_file import whole_file
 from protocol.errors import RemoteWireError
 
 CHUNK_BYTES = 1 << 18
+FILE_BYTES_MAX = 1 << 33  # an STL of L has 840 MB
 CREATED = 201
 TIMEOUT = aiohttp.ClientTimeout(total=None, sock_connect=10, sock_read=600)  # a node writes a file before it sends it
 
@@ -39,17 +40,19 @@ async def fetch_scan(
             async for chunk in response.content.iter_chunked(CHUNK_BYTES):
                 file.write(chunk)
                 moved(file.tell(), response.content_length)
+                if file.tell() > FILE_BYTES_MAX:
+                    raise RemoteWireError(f"{response.url} sends more than {FILE_BYTES_MAX} bytes")
             return file.tell()
 
 
-class Sent(NamedTuple):
+class Taken(NamedTuple):
     """A scan that a node has taken. is_new : it had no such scan before."""
 
     scan: str
     is_new: bool
 
 
-async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> Sent:
+async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | None = None, moved: Moved) -> Taken:
     """Add a native grid (.npz, open at its start) to a node's library.
 
     Raises what `connect` raises; then the node has nothing of it.
@@ -67,7 +70,7 @@ async def send_scan(node: NodeAddress | str, file: BinaryIO, *, token: str | Non
         said = reply(response.status, await bounded_body(response))
     if not isinstance(said, dict) or not isinstance(said.get("id"), str):
         raise RemoteWireError("the node took the scan and did not say its id")
-    return Sent(str(said["id"]), response.status == CREATED)
+    return Taken(str(said["id"]), response.status == CREATED)
 
 
 @asynccontextmanager

@@ -1,4 +1,4 @@
-"""Foreign text where people read it: what others wrote must not steer a terminal or forge a line of a log."""
+"""Words for people: foreign text, which must not steer a terminal or forge a line of a log, and counts of things."""
 
 from __future__ import annotations
 
