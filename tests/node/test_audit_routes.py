@@ -13,6 +13,7 @@ from node.audit import done_trail, read_trail, refused_trail
 from node.audit_routes import AUDITED
 from tests.node.entrance import Entrance, entrance
 from tests.node.test_auth import routes
+from tests.waiting import until
 
 PRIVATE = ("a secret name", "subject-0815")
 NOT_AUDITED = {  # they show, change and delete no scan, or are noted where they are done
@@ -78,9 +79,8 @@ async def test_a_stream_is_noted_once_for_each_scan_it_opens(node: Entrance) -> 
         for at in (0.2, 0.4, 0.6):
             await session.look(at, 0.5)
         watching = asyncio.ensure_future(anext(session.live()))
-        async with asyncio.timeout(10):
-            while not [one for one in read_trail(done_trail(node.library.folder, 1 << 26)) if one.event == "watched"]:
-                await asyncio.sleep(0.01)
+        trail = done_trail(node.library.folder, 1 << 26)
+        await until(lambda: any(one.event == "watched" for one in read_trail(trail)))
         watching.cancel()
     assert noted(node)[1:] == [("opened", "view", "scan", ""), ("watched", "view", "", "")]
 
@@ -121,8 +121,7 @@ async def test_an_admin_reads_the_log(node: Entrance) -> None:
     admin = node.token("admin")
     async with node.ask("GET", f"/v1/scans/{node.scan}/sidecar", admin):
         pass
-    while node.server.audit.waiting:
-        await asyncio.sleep(0.01)
+    await until(lambda: not node.server.audit.waiting)
     async with node.ask("GET", f"/v1/audit?limit=1&scan={node.scan[:8]}&by=admin&since=2026", admin) as answer:
         [one] = await answer.json()
         assert (one["event"], one["by"], one["scan"]) == ("read", "admin", node.scan)

@@ -17,6 +17,7 @@ from node import gate
 from node.config import Limits, Server
 from protocol.messages import PROTOCOL
 from tests.node.entrance import Entrance, entrance
+from tests.waiting import until
 
 
 def untrusting() -> ssl.SSLContext:
@@ -100,9 +101,7 @@ async def test_one_address_has_so_many_connections_and_is_told(tmp_path: Path) -
             assert await end_of(refused[0]) == b""
         assert node.server._gate.turned_away == 1
         await stack.aclose()
-        async with asyncio.timeout(10):
-            while node.server._gate.connections:
-                await asyncio.sleep(0.01)
+        await until(lambda: not node.server._gate.connections)
         async with line_to(node) as line:
             assert b" 200 OK" in await answer_on(line)
 
@@ -199,8 +198,6 @@ async def test_who_does_not_read_the_answer_is_cut_off(tmp_path: Path) -> None:
         writer.transport.pause_reading()  # type: ignore[attr-defined]
         for _ in range(300):
             writer.write(f"GET /v1/scans/{node.scan}.stl HTTP/1.1\r\n{head}".encode())
-        async with asyncio.timeout(60):
-            while node.server._gate.connections:
-                await asyncio.sleep(0.05)
+        await until(lambda: not node.server._gate.connections)
         async with node.ask("GET", "/healthz") as answer:
             assert answer.status == 200

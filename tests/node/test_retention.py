@@ -23,6 +23,7 @@ from tests.node.entrance import Entrance, entrance
 from tests.node.scans import make_grid
 from tests.node.test_journal import HEADER, INFO
 from tests.node.test_library_command import run
+from tests.waiting import until
 
 NOW = 1.8e9
 MONTH = Retention(max_age_days=30)
@@ -176,13 +177,6 @@ async def test_what_is_deleted_is_gone_from_the_node(tmp_path: Path) -> None:
         maps = Path("/proc/self/maps")  # a thread may be measuring its texture still
         place_on_disk = f"{node.library.folder}/{node.scan}/"  # other tests may hold the same scan of theirs
         await until(lambda: place_on_disk not in maps.read_text())
-
-
-async def until(is_so: object) -> None:
-    assert callable(is_so)
-    async with asyncio.timeout(20):
-        while not is_so():
-            await asyncio.sleep(0.02)
 
 
 def test_what_expires_is_said_in_words(library: Library) -> None:

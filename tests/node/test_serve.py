@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +16,7 @@ from node.library import About, Library
 from node.scan_quality import ScanQuality
 from tests.node.scans import make_grid
 from tests.node.served import Client, served
+from tests.waiting import until
 
 
 class Turntable:
@@ -190,9 +190,7 @@ async def test_health_says_when_the_audit_log_cannot_be_written(tmp_path: Path, 
     (tmp_path / "audit").write_text("no folder")
     async with served(library) as (node, server):
         await ask(node, "/v1/scans")
-        async with asyncio.timeout(10):
-            while not server.audit.trouble:
-                await asyncio.sleep(0.01)
+        await until(lambda: server.audit.trouble)
         _, said = await ask(node, "/healthz")
     assert said["reasons"] == ["the audit log cannot be written: Not a directory"]
 

@@ -11,6 +11,7 @@ from typing import Any
 from client import connect
 from client.truth import Truth
 from foveascan import started
+from tests.waiting import until_ready
 
 SHARED_DATA = Path(__file__).parents[3] / "shared" / "data"
 SWEEP_S = 60
@@ -32,8 +33,7 @@ def sweep(url: str) -> str:
     async def once() -> str:
         async with connect(url) as session:
             published = session.published()
-            while (await session.scanner())["phase"] != "ready":
-                await asyncio.sleep(0.05)
+            await until_ready(session)
             await session.start_sweep()
             async with asyncio.timeout(SWEEP_S):
                 return await anext(published)

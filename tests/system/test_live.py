@@ -15,6 +15,7 @@ from client.live import LiveFrame
 from client.truth import Truth
 from foveascan import started
 from tests.system.line import RunningNode, run_line
+from tests.waiting import until_ready
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +70,7 @@ async def test_an_unplugged_scanner_ends_the_view_as_interrupted(tmp_path: Path)
     serve = ["serve", "--library", str(tmp_path / "library"), "--listen", "127.0.0.1:0", "--insecure", "--json"]
     with started(*simulate) as (scanner, link), started(*serve, "--scanner", link["path"]) as (_, ready):
         async with connect(ready["url"]) as session:
-            while (await session.scanner())["phase"] != "ready":
-                await asyncio.sleep(0.05)
+            await until_ready(session)
             watching = asyncio.create_task(watch(session))
             await session.start_sweep()
             async for frame in session.live():

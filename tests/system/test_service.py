@@ -19,6 +19,7 @@ from client import NodeLost, connect
 from foveascan import PROGRAM, started
 from node.library import Library
 from tests.system.line import RunningNode
+from tests.waiting import until_ready
 
 STOP_S = 5.0  # REQUIREMENTS AT-36
 WATCHDOG_S = 8.0
@@ -67,8 +68,7 @@ def deaf_client(url: str) -> socket.socket:
 
 async def ready_to_sweep(url: str) -> None:
     async with connect(url) as session:
-        while (await session.scanner())["phase"] != "ready":
-            await asyncio.sleep(0.05)
+        await until_ready(session)
 
 
 def test_systemd_hears_ready_when_it_is_true_then_life_then_the_end(tmp_path: Path) -> None:
