@@ -1,4 +1,4 @@
-"""A capture thread and the plug of its scanner, for the tests of both."""
+"""What tests of many files share: a scan to plan on; a capture thread and the plug of its scanner."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from node.library import Scan
 from tests.node.capturing import Node, Plug
+from tests.node.scans import keep, make_grid
+
+
+@pytest.fixture(scope="session")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """Small, with voids; a scan never changes, so one serves all."""
+    return keep(make_grid(), tmp_path_factory.mktemp("library"))
 
 
 @pytest.fixture

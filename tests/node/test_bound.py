@@ -17,17 +17,11 @@ from node.texture_model import TextureModel
 from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.lattice import Channel
-from tests.node.scans import keep, make_grid
 
 BOTH: tuple[m.CodecName, ...] = ("jpeg", "htj2k")
 EASY, HARD = m.Look(2, 0.75, 0.5, texture_db=35), m.Look(2, 0.75, 0.5, texture_db=55)
 NOISE = 1e-9
 STATE = cast("ClientState", None)  # nobody looks at it
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    return keep(make_grid(), tmp_path_factory.mktemp("library"))
 
 
 @pytest.fixture(scope="module")

@@ -21,15 +21,10 @@ from protocol.errors import LatticeError
 from protocol.grid import Grid, GridSpec
 from protocol.lattice import Channel
 from protocol.refinement import CRC, HEADER, Refinement
-from tests.node.scans import keep, make_grid
+from tests.node.scans import keep
 
 ALPHA = single(0.5)
 S = single(2.4)
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    return keep(make_grid(), tmp_path_factory.mktemp("scan"))
 
 
 @pytest.fixture(scope="module")

@@ -18,12 +18,6 @@ from protocol.fovea import finest_scale
 from protocol.lattice import Channel
 from protocol.messages import ClassicLookParameters, Look
 from protocol.refinement import Refinement
-from tests.node.scans import keep, make_grid
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    return keep(make_grid(), tmp_path_factory.mktemp("scan"))
 
 
 @pytest.fixture(scope="module")

@@ -31,11 +31,6 @@ EXACT = LookParameters(RangeParameters(1, 1), TextureParameters(1, 255))
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    return keep(make_grid(), tmp_path_factory.mktemp("library"))
-
-
-@pytest.fixture(scope="module")
 def view(scan: Scan) -> FirstView:
     return build_first_view(scan, "htj2k", 32768)
 

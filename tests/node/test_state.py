@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from node.first_view import build_first_view
 from node.foveate import plan_update
@@ -14,12 +13,6 @@ from protocol.lattice import Channel
 from protocol.messages import Look, LookParameters, RangeParameters
 from protocol.reconstruct import paste
 from protocol.region import region_round
-from tests.node.scans import keep, make_grid
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    return keep(make_grid(), tmp_path_factory.mktemp("library"))
 
 
 def restated(state: ClientState, level: int | None = None, rank: int = 65534) -> ClientState:
