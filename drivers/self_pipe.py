@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import select
-from contextlib import suppress
+import threading
 
 
 class SelfPipe:
@@ -15,6 +15,7 @@ class SelfPipe:
 
     def __init__(self, descriptor: int) -> None:
         self._woken, self._wake = os.pipe()
+        self._closing = threading.Lock()  # else a wake may reach a file that was opened since, under the same number
         self._poll = select.poll()
         for end in (descriptor, self._woken):
             self._poll.register(end, select.POLLIN)
@@ -34,12 +35,14 @@ class SelfPipe:
 
     def wake(self) -> None:
         """End the wait that runs, or else the next one; of no effect once closed."""
-        with suppress(OSError):
-            os.write(self._wake, b"x")
+        with self._closing:
+            if not self.is_closed:
+                os.write(self._wake, b"x")
 
     def close(self) -> None:
         """Let go of the pipe; harmless when repeated."""
-        if not self.is_closed:
-            for end in (self._woken, self._wake):
-                os.close(end)
-            self._woken = self._wake = -1
+        with self._closing:
+            if not self.is_closed:
+                for end in (self._woken, self._wake):
+                    os.close(end)
+                self._woken = self._wake = -1
