@@ -6,12 +6,14 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from node.classic import ClassicCoded, ClassicState
 from node.classic_planner import ClassicUpdate, plan_classic
 from node.coded import Coded
 from node.foveate import Update, plan_update
 from node.library import Scan
+from node.range_model import RangeModel
 from node.refine_texture import mse_of_db
 from node.state import ClientState
 from node.texture_model import TextureModel
@@ -40,6 +42,8 @@ class Bound:
         superseded: Callable[[], bool],
         model: TextureModel | None,
         quick: bool,
+        range_model: RangeModel | None = None,
+        hurried: bool = False,
     ) -> Update | ClassicUpdate:
         """The update that answers a look; arguments as for plan_update. codecs : what the client takes, best first.
 
@@ -51,10 +55,14 @@ class Bound:
         if isinstance(self.state, ClassicState):
             return plan_classic(self.scan, self.state, look, budget_bytes, superseded)
         codec = choose_codec(codecs, self.scan, look, model)
-        update = plan_update(self.scan, self.state, look, codec, budget_bytes, superseded, model, quick)
+        plan = partial(
+            plan_update, self.scan, self.state, look, budget_bytes=budget_bytes, superseded=superseded, model=model,
+            quick=quick, range_model=range_model, hurried=hurried,
+        )  # fmt: skip
+        update = plan(codec)
         if codec == "htj2k" or "htj2k" not in codecs or not _falls_short(update, look):
             return update
-        better = plan_update(self.scan, self.state, look, "htj2k", budget_bytes, superseded, model, quick)
+        better = plan("htj2k")
         return replace(better, encodes=update.encodes + better.encodes)
 
     def take(self, update: Update | ClassicUpdate, look: m.Look) -> list[bytes]:

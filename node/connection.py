@@ -300,11 +300,11 @@ class Connection:
     async def _answer_look(self) -> None:
         """When it is our turn among all streams, plan what is the newest look by then; send what comes of it."""
         started_s = time.monotonic()
-        async with self._exhibits.turns:
+        async with self._exhibits.turn() as is_pressing:
             bound, look, self._look = self._bound, self._look, None
             if look is None:  # cancelled while it waited
                 return
-            answer = await self._planned(bound, look)
+            answer = await self._planned(bound, look, is_pressing)
         if isinstance(answer, m.Refused | m.Updated):
             await self._send(answer)
             return
@@ -313,14 +313,16 @@ class Connection:
         self._rate.encoded(spent_s)
         await self._send_update(bound, look, answer, spent_s)
 
-    async def _planned(self, bound: Bound | None, look: m.Look) -> Update | ClassicUpdate | m.Refused | m.Updated:
+    async def _planned(
+        self, bound: Bound | None, look: m.Look, hurried: bool
+    ) -> Update | ClassicUpdate | m.Refused | m.Updated:
         """What answers a look, or what is said instead."""
         if bound is None:
             why = "the scan was deleted: open another" if self._is_gone else "open a scan first"
             return m.Refused(look.request, "not open", why)
         self._running_look = look
         try:
-            update = await self._plan(bound, look)
+            update = await self._plan(bound, look, hurried)
         except (LatticeError, CodecError) as error:
             return m.Refused(look.request, "bad request", str(error)[:500])
         finally:
@@ -328,7 +330,7 @@ class Connection:
         self._gave_way = update.reason == "superseded"
         return self._superseded(look) if self._gave_way or not still_wanted else update
 
-    async def _plan(self, bound: Bound, look: m.Look) -> Update | ClassicUpdate:
+    async def _plan(self, bound: Bound, look: m.Look, hurried: bool) -> Update | ClassicUpdate:
         budget = look.max_bytes
         if look.max_wait_s is not None:
             affordable = self._rate.budget_bytes(look.max_wait_s)
@@ -338,9 +340,9 @@ class Connection:
             """A newer look stops this one, but no two in a row: who clicks faster than we plan gets something, too."""
             return self._running_look is not look or (self._look is not None and not self._gave_way)
 
-        model = self._exhibits.texture_model(bound.scan)
+        models = self._exhibits.texture_model(bound.scan), self._exhibits.range_model(bound.scan)
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
-        job = partial(bound.plan, look, self._codecs, budget, superseded, model, quick)
+        job = partial(bound.plan, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried)
         return await self._exhibits.work(job, "look")
 
     async def _send_update(self, bound: Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float) -> None:

@@ -7,13 +7,15 @@ import os
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import asynccontextmanager
 from typing import Literal, TypeVar, overload
 
 from node.classic import ClassicView, build_classic_view
 from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.library import Library, Scan
+from node.range_model import RangeModel
 from node.right_of_way import RightOfWay
 from node.texture_model import TextureModel
 from protocol.errors import LibraryError
@@ -22,6 +24,7 @@ from protocol.messages import CodecName, Profile
 VIEWS_MAX = 8
 GIVES_WAY = 10  # niceness of threads that compute for clients: a scanner does not wait
 MODELS_MAX = 8
+PRESSING = 2  # looks that wait for each thread
 T = TypeVar("T")
 Work = Literal["look", "fovea", "view", "other"]
 Key = tuple[str, CodecName, Profile]
@@ -41,7 +44,7 @@ class Exhibits:
         self._way = way or RightOfWay()
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, "encode", _give_way)
-        self.turns = asyncio.Semaphore(workers)  # of looks that are planned: first come, first served
+        self._turns, self._waiting = asyncio.Semaphore(workers), 0
         self._workers = workers
         self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0
@@ -49,7 +52,7 @@ class Exhibits:
         self._views: OrderedDict[Key, asyncio.Future[Opening]] = OrderedDict()
         self._closing = threading.Event()
         self._surveyor = ThreadPoolExecutor(1, "survey", _give_way)
-        self._models: OrderedDict[str, Future[TextureModel]] = OrderedDict()
+        self._models: OrderedDict[str, tuple[Future[RangeModel], Future[TextureModel]]] = OrderedDict()
 
     @overload
     async def open(self, scan_id: str, codec: CodecName) -> tuple[Scan, FirstView]: ...
@@ -78,19 +81,38 @@ class Exhibits:
 
     def texture_model(self, scan: Scan) -> TextureModel | None:
         """What the scan's texture takes and reaches; None until that is measured."""
-        model = self._models.get(scan.id)
-        return model.result() if model is not None and model.done() and model.exception() is None else None
+        return _done(self._models[scan.id][1]) if scan.id in self._models else None
+
+    def range_model(self, scan: Scan) -> RangeModel | None:
+        """What interpolating the scan's range misses; None until that is measured."""
+        return _done(self._models[scan.id][0]) if scan.id in self._models else None
 
     @property
     def surveying(self) -> int:
         """How many opened scans' textures are not measured yet."""
-        return sum(not model.done() for model in self._models.values())
+        return sum(not texture.done() for _, texture in self._models.values())
 
     def forget(self, scan_id: str) -> None:
         """Drop what was made of a scan that is gone."""
         for key in [key for key in self._views if key[0] == scan_id]:
             del self._views[key]
         self._models.pop(scan_id, None)
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[bool]:
+        """Inside it is the caller's turn to plan a look: first come, first served, one for each thread at once.
+
+        Whether that is pressing: so many wait that nobody would be served soon if each look were given its full time.
+        """
+        self._waiting += 1
+        try:
+            await self._turns.acquire()
+        finally:
+            self._waiting -= 1
+        try:
+            yield self._waiting >= PRESSING * self._workers
+        finally:
+            self._turns.release()
 
     def tell(self, encoded: Callable[[Work, float, float], object]) -> None:
         """Have somebody told of every job: what it was for, how long it waited and took [s], in the event loop."""
@@ -133,14 +155,16 @@ class Exhibits:
         self._pool.shutdown(cancel_futures=True)
 
     def _survey(self, scan: Scan, view: FirstView) -> None:
-        """Have the scan's texture measured, one scan at a time, beside everything else."""
+        """Have the scan's range and texture measured, one scan at a time, beside everything else."""
         if scan.id not in self._models:
-            self._models[scan.id] = self._surveyor.submit(self._model, scan, view)
+            range_model = self._surveyor.submit(RangeModel, scan.spec, scan.range_steps, scan.filled)
+            self._models[scan.id] = range_model, self._surveyor.submit(self._texture_model, scan, view)
             while len(self._models) > MODELS_MAX:
-                self._models.popitem(last=False)[1].cancel()
+                for model in self._models.popitem(last=False)[1]:
+                    model.cancel()
         self._models.move_to_end(scan.id)
 
-    def _model(self, scan: Scan, view: FirstView) -> TextureModel:
+    def _texture_model(self, scan: Scan, view: FirstView) -> TextureModel:
         def is_over() -> bool:
             with self._way.given():
                 return self._closing.is_set()
@@ -152,6 +176,11 @@ class Exhibits:
         if profile == "classic":
             return scan, build_classic_view(scan, codec)
         return scan, build_first_view(scan, codec, self._first_view_bytes)
+
+
+def _done(model: Future[T]) -> T | None:
+    """What a finished future holds; None of one that runs or failed."""
+    return model.result() if model.done() and not model.cancelled() and model.exception() is None else None
 
 
 def _give_way() -> None:

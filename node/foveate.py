@@ -19,6 +19,7 @@ import numpy as np
 from node.coded import Coded, framed
 from node.library import Scan
 from node.quality import Encodes, Superseded
+from node.range_model import RangeModel
 from node.range_search import RangeSearch
 from node.refine_range import code_range, note_range, settle_range
 from node.refine_texture import code_texture, db_of_mse, mse_of_db, note_texture, select_texture
@@ -82,15 +83,20 @@ def plan_update(
     superseded: Callable[[], bool] = lambda: False,
     model: TextureModel | None = None,
     quick: bool = False,
+    range_model: RangeModel | None = None,
+    hurried: bool = False,
 ) -> Update:
     """Plan the update that answers a look.
 
     codec : the texture codec for this client.   budget_bytes : what the update may take; None for no limit.
     superseded : asked between encodes; when true, what is planned so far is dropped.
     model : what the scan's texture takes, where that is known by now.   quick : spare time rather than bytes.
+    range_model : what its range misses, likewise.   hurried : others wait, so spare what a few percent of bytes buy.
     Raises LatticeError or CodecError where explicit parameters do not fit the scan.
     """
-    planner = _Planner(scan, state.copy(), look, codec, budget_bytes, superseded, model, quick)
+    planner = _Planner(
+        scan, state.copy(), look, codec, budget_bytes, superseded, model, quick, range_model, hurried
+    )
     try:
         planner.run()
     except Superseded:
@@ -111,6 +117,8 @@ class _Planner:
         superseded: Callable[[], bool],
         model: TextureModel | None,
         quick: bool,
+        range_model: RangeModel | None,
+        hurried: bool,
     ) -> None:
         self._scan, self._state, self._look, self._codec, self._quick = scan, state, look, codec, quick
         self._left = math.inf if budget_bytes is None else float(budget_bytes - REPLY_BYTES)
@@ -121,8 +129,10 @@ class _Planner:
         self._limited = False
         self._window = look.window if look.scale is None else look.scale**2
         self._range_region, self._texture_region = self._regions(self._window)
-        self._range = RangeSearch(scan, state, look, self._range_region, self._encodes)
-        self._texture = TextureSearch(scan, state, look, self._texture_region, codec, model, quick, self._encodes)
+        self._range = RangeSearch(scan, state, look, self._range_region, range_model, hurried, self._encodes)
+        self._texture = TextureSearch(
+            scan, state, look, self._texture_region, codec, model, quick, hurried, self._encodes
+        )
 
     def _regions(self, window: float) -> tuple[Region, Region]:
         """What a share of the area round the click is of range and of texture."""

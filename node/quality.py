@@ -59,7 +59,9 @@ class QualitySearch:
         expected: Expected,
         lowest: int,
         highest: int,
+        tries: int = TRIES,
     ) -> None:
+        self._tries = tries
         self._target = target_mse
         self._aim_bytes, self._limit = aim_bytes, limit_bytes
         self._expected = expected
@@ -89,7 +91,7 @@ class QualitySearch:
         spared = 10 * math.log10(self._target / max(point.mse, 1e-9)) if reached else 0.0
         filled = len(point.coded.payload) >= FILL * self._aim_bytes
         done = spared <= OVERSHOOT_DB if reached else filled and self.limited
-        if done or ((reached or self.limited) and len(self._tried) >= TRIES):
+        if done or ((reached or self.limited) and len(self._tried) >= self._tries):
             self._next = None
             return
         worse = max(point.mse, MSE_MIN) / self._expected.mse(point.quality)  # a plain texture leaves no error at all

@@ -37,9 +37,11 @@ FEW_CELLS = 1  # too far off in a block that counts as good
 
 
 def reach_range(
-    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, target_steps: float
+    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, target_steps: float, *, quick: bool = False
 ) -> list[Coded]:
     """Encode refinements after which the whole region is within target_steps, held blocks included.
+
+    quick : spare time rather than bytes.
 
     Blocks held well enough are left out by a bitmap, and so are those held at better values than wanted, since what
     improves them would have to be as good throughout. Where what is kept turns out too poor for this window, it is sent
@@ -52,12 +54,12 @@ def reach_range(
     apart = good | better if better.any() or good[touched].mean() >= LISTED_SHARE else np.zeros_like(good)
     apart |= ~touched
     allowed = _allowed_beyond(scan, region)
-    coded = _code_listed(scan, state, region, wanted, apart)
+    coded = _code_listed(scan, state, region, wanted, apart, quick)
     for _ in range(TRIES_MAX):
         if coded is None or _cells_beyond(scan, coded, region, target_steps) <= allowed:
             break
         wanted = RangeParameters(p=wanted.p, quantum=max(wanted.quantum * 3 // 4, 1), s=wanted.s)
-        coded = _code_listed(scan, state, region, wanted, apart)
+        coded = _code_listed(scan, state, region, wanted, apart, quick)
     first = [coded] if coded is not None else []
     beyond = _cells_beyond(scan, coded, region, target_steps)
     kept = touched & ~_of_region(_adopted(held.shape, coded), region)
@@ -115,13 +117,13 @@ def _level_at(p: int) -> int:
 
 
 def _code_listed(
-    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, apart: BoolArray
+    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, apart: BoolArray, quick: bool = False
 ) -> Coded | None:
     """Encode the region's blocks but for those apart."""
     parameters = range_lattice(region, wanted)
     if apart.any():
         parameters = replace(parameters, listed=mask_to_runs(~apart))
-    return code_range_lattice(scan, state, parameters, wanted.quantum)
+    return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick)
 
 
 def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:

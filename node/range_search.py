@@ -13,12 +13,14 @@ from node.coded import Coded
 from node.library import Scan
 from node.quality import Encodes
 from node.range_bitmaps import reach_range
+from node.range_model import RangeModel
 from node.refine_range import (
     QUANTUM_MAX,
     Trial,
     choose_range,
     code_range,
     expected_range_bytes,
+    guess_range,
     select_range,
     trial_of,
 )
@@ -36,20 +38,41 @@ FINENESS = 1 / 32  # of a quantum, to which it is searched
 DOUBLINGS_A_HALVING = 1.4  # of the quantum, of the bytes
 FINER_FROM = 0.25  # of the quantum wanted: from there on a closer spacing may leave less error
 SPACING_MAX = 8
+OVERSTATED = 1.06  # by this at most are interpolated errors as they are known beforehand
 
 
 class RangeSearch:
     """Finds the range refinements that answer a look."""
 
-    def __init__(self, scan: Scan, state: ClientState, look: Look, region: Region, encodes: Encodes) -> None:
+    def __init__(
+        self,
+        scan: Scan,
+        state: ClientState,
+        look: Look,
+        region: Region,
+        model: RangeModel | None,
+        hurried: bool,
+        encodes: Encodes,
+    ) -> None:
         self._scan, self._state, self._look, self._region, self._encodes = scan, state, look, region, encodes
+        self._model, self._hurried = model, hurried
         self.target_steps = look.range_mm / scan.spec.step_mm
         self._expected: dict[RangeParameters, float] = {}
+        self._errors: dict[int, float] = {}
         self._trials: dict[int, Trial | None] = {}
 
     def choose(self, target_steps: float) -> RangeParameters:
-        """The cheapest parameters that reach a range error, with the skirt asked for."""
-        return self._with_skirt(choose_range(self._trial, target_steps))
+        """The cheapest parameters that reach a range error, with the skirt asked for; about these in a hurry."""
+        if self._model is None:
+            return self._with_skirt(choose_range(self._trial, target_steps))
+        guess = guess_range(self._interpolated, target_steps)
+        if self._hurried:
+            return self._with_skirt(guess)
+
+        def possible(p: int) -> Trial | None:
+            return self._trial(p) if self._interpolated(p) <= OVERSTATED * target_steps else None
+
+        return self._with_skirt(choose_range(possible, target_steps, guess.p))
 
     def expected_bytes(self, wanted: RangeParameters, region: Region | None = None) -> float:
         """What range of the window (or of another region) is expected to take on the wire; 0: it is held already."""
@@ -62,7 +85,9 @@ class RangeSearch:
     def reach(self, wanted: RangeParameters) -> list[Coded]:
         """The refinements after which the window is as good as asked for."""
         self._encodes.add()
-        found = reach_range(self._scan, self._state, self._region, wanted, self.target_steps)
+        found = reach_range(
+            self._scan, self._state, self._region, wanted, self.target_steps, quick=self._hurried
+        )
         self._encodes.count += max(len(found) - 1, 0)
         return found
 
@@ -80,7 +105,7 @@ class RangeSearch:
                 break
             tried.add((parameters.p, parameters.quantum))
             self._encodes.add()
-            coded = code_range(self._scan, self._state, self._region, parameters)
+            coded = code_range(self._scan, self._state, self._region, parameters, quick=self._hurried)
             if coded is None:
                 return best
             larger = coded.wire_bytes / max(self.expected_bytes(parameters), 1.0)
@@ -126,6 +151,13 @@ class RangeSearch:
     def _error(self, parameters: RangeParameters) -> float:
         trial = self._trial(parameters.p)
         return trial.error(parameters.quantum) if trial is not None else 0.0
+
+    def _interpolated(self, p: int) -> float:
+        """Error of a spacing that is not quantised. [steps]"""
+        assert self._model is not None  # else nobody asks
+        if p not in self._errors:
+            self._errors[p] = self._model.error(self._region, p)
+        return self._errors[p]
 
     def _trial(self, p: int) -> Trial | None:
         if p not in self._trials:

@@ -31,17 +31,24 @@ PERCENTILE = 99
 QUANTUM_MAX = 4096
 FINENESS_COSTS = 0.35  # blocks held at a small quantum can only be made finer at one as small (F-09c)
 TRIES_MAX = 4  # quanta tried at a spacing
+WELL_WITHIN = 0.75  # of the target: where interpolating leaves no more, no closer spacing takes fewer bytes
+ERROR_A_QUANTUM = 0.46  # at the 99th percentile, at most nearly always
 AIM = 0.985  # of the target: what is interpolated is not met exactly
 FINENESS = 0.1  # of a quantum, to which it is searched
 
 
-def choose_range(trials: Callable[[int], Trial | None], target_steps: float) -> RangeParameters:
+def choose_range(
+    trials: Callable[[int], Trial | None], target_steps: float, surely: Literal[1, 2, 4, 8] = 1
+) -> RangeParameters:
     """The cheapest parameters whose error in the region is at most target_steps (99th percentile, "higher").
 
-    trials : the trial of each spacing, None where it is impossible.
+    trials : the trial of each spacing, None where it is impossible.   surely : a spacing that is known to do well; none
+    below it is tried.
     """
     best, least_bytes = RangeParameters(p=1, quantum=1), math.inf
     for p in SPACINGS:
+        if p < surely:
+            break
         trial = None if p > 1 and target_steps < 1 else trials(p)
         if trial is None or (p > 1 and trial.error(1) > target_steps):
             continue
@@ -51,6 +58,17 @@ def choose_range(trials: Callable[[int], Trial | None], target_steps: float) -> 
             break
         best, least_bytes = RangeParameters(p=p, quantum=quantum), size_bytes
     return best
+
+
+def guess_range(interpolated: Callable[[int], float], target_steps: float) -> RangeParameters:
+    """About what choose_range would find, without a trial: what comes of it is to be checked.
+
+    interpolated : the error that each spacing leaves at quantum 1, 0 at spacing 1.
+    """
+    errors = ((p, interpolated(p)) for p in SPACINGS)
+    p, error = next((p, e) for p, e in errors if p == 1 or (target_steps >= 1 and e <= WELL_WITHIN * target_steps))
+    left = math.sqrt(target_steps**2 - error**2) / ERROR_A_QUANTUM
+    return RangeParameters(p=p, quantum=max(min(round(left), _always_within(target_steps)), 1))
 
 
 def trial_of(scan: Scan, state: ClientState, region: Region, p: int) -> Trial | None:
@@ -214,13 +232,18 @@ def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:
     return 65535 - int(held.rank[where][improves].max(initial=COARSE_RANK))
 
 
+def _always_within(target_steps: float) -> int:
+    """The largest quantum no value coded with which is further off than a target."""
+    return min(2 * int(target_steps) + 1, QUANTUM_MAX)
+
+
 def _largest_quantum(trial: Trial, p: int, target_steps: float) -> int:
     """About the largest quantum that keeps the region's error within target_steps.
 
     Quantising alone leaves half a quantum at most, and at spacing 1 nearly that at the 99th percentile; so twice the
     target is nearly always right. What interpolating leaves adds to it in squares.
     """
-    guess = min(2 * int(target_steps) + 1, QUANTUM_MAX)
+    guess = _always_within(target_steps)
     if p == 1:
         return guess
     low, low_error = 1, trial.error(1)

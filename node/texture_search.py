@@ -14,7 +14,7 @@ from functools import cached_property
 
 from node.coded import Coded, framed, message_overhead
 from node.library import Scan
-from node.quality import MARGIN, Encodes, Point, QualitySearch
+from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch
 from node.refine_texture import (
     CODECS,
     adopted_error,
@@ -70,11 +70,13 @@ class TextureSearch:
         codec: CodecName,
         model: TextureModel | None,
         quick: bool,
+        hurried: bool,
         encodes: Encodes,
     ) -> None:
         self._scan, self._state, self._look, self._region, self._model = scan, state, look, region, model
         self._codec: CodecName = codec
         self._quick, self._encodes = quick, encodes
+        self._tries = 1 if hurried else TRIES
         self._target_mse = mse_of_db(look.texture_db)
         self._lowest, self._highest = quality_bounds(codec)
         self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
@@ -181,7 +183,7 @@ class TextureSearch:
         best: Point | None = None
         while p in SPACINGS:
             bounds = aim_bytes - OVERHEAD_BYTES, limit_bytes - OVERHEAD_BYTES, self._expected(p, listed)
-            search = QualitySearch(self._target_mse, *bounds, self._lowest, self._highest)
+            search = QualitySearch(self._target_mse, *bounds, self._lowest, self._highest, self._tries)
             if not self._try_qualities(search, p, listed):
                 return None
             self.limited |= search.limited
