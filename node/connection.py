@@ -342,6 +342,8 @@ class Connection:
 
         models = self._exhibits.texture_model(bound.scan), self._exhibits.range_model(bound.scan)
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
+        if hurried:
+            self._metrics.hurried()
         job = partial(bound.plan, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried)
         return await self._exhibits.work(job, "look")
 

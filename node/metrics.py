@@ -55,6 +55,9 @@ class Metrics:
         self._waited = Histogram(
             "foveascan_encode_wait_seconds", "Waiting for an encoding thread", buckets=ENCODE_S, registry=registry
         )
+        self._hurried = Counter(
+            "foveascan_hurried_looks", "Looks planned in a hurry, since others waited", registry=registry
+        )
         self._updates = Counter("foveascan_updates", "Looks answered on streams", ["reason"], registry=registry)
         self._opened = Counter("foveascan_opened", "Scans opened on streams", registry=registry)
         self._sent = Counter("foveascan_sent_bytes", "Bytes sent, before TLS", ["by"], registry=registry)
@@ -79,6 +82,10 @@ class Metrics:
         """A job of an encoding thread is done. of : "look", "fovea", "view" or "other"."""
         self._waited.observe(waited_s)
         self._encoding.labels(of).observe(took_s)
+
+    def hurried(self) -> None:
+        """A look was planned in a hurry."""
+        self._hurried.inc()
 
     def updated(self, reason: str) -> None:
         """A look was answered."""

@@ -55,13 +55,14 @@ def reach_range(
     apart |= ~touched
     allowed = _allowed_beyond(scan, region)
     coded = _code_listed(scan, state, region, wanted, apart, quick)
+    beyond = _cells_beyond(scan, coded, region, target_steps)
     for _ in range(TRIES_MAX):
-        if coded is None or _cells_beyond(scan, coded, region, target_steps) <= allowed:
+        if beyond <= allowed:
             break
         wanted = RangeParameters(p=wanted.p, quantum=max(wanted.quantum * 3 // 4, 1), s=wanted.s)
         coded = _code_listed(scan, state, region, wanted, apart, quick)
+        beyond = _cells_beyond(scan, coded, region, target_steps)
     first = [coded] if coded is not None else []
-    beyond = _cells_beyond(scan, coded, region, target_steps)
     kept = touched & ~_of_region(_adopted(held.shape, coded), region)
     if beyond <= allowed and not kept.any():
         return first

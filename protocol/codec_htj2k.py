@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import lru_cache
 from typing import Any
 
 import imagecodecs
@@ -86,6 +87,7 @@ def decomposition_levels(shape: tuple[int, ...]) -> int:
     return min(max(min(shape[:2]).bit_length() - 2, 1), LEVELS_MAX)
 
 
+@lru_cache(maxsize=256)
 def main_header(shape: tuple[int, ...], quality: int, *, roomy: bool = False) -> bytes:
     """SOC SIZ CAP COD QCD, byte for byte as OpenJPH writes them.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from client.model import Model
+from node import refine_range
 from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.foveate import REPLY_BYTES, Update, plan_update
 from node.library import Scan
+from node.range_model import RangeModel
 from node.state import ClientState
 from node.texture_model import TextureModel
 from protocol import messages as m
@@ -27,6 +30,7 @@ from tests.node.scans import keep, make_grid
 
 CLICKS = [(0.1, 0.5), (0.62, 0.3), (0.99, 0.02), (0.4, 0.98)]
 places = st.floats(0, 0.999)
+TURN = (0.1, 0.3, 0.5, 0.7, 0.9)
 EXACT = LookParameters(RangeParameters(1, 1), TextureParameters(1, 255))
 
 
@@ -87,12 +91,16 @@ class Viewer:
         return float(10 * np.log10(255**2 / max(np.mean((held - true) ** 2), 1e-9)))
 
 
+@pytest.mark.parametrize("pace", ["unknown", "known", "hurried"])
 @pytest.mark.parametrize("codec", ["htj2k", "jpeg"])
 @pytest.mark.parametrize(("u", "v"), CLICKS)
-def test_reaches_the_quality_asked_for(scan: Scan, view: FirstView, codec: m.CodecName, u: float, v: float) -> None:
+def test_reaches_the_quality_asked_for(
+    scan: Scan, view: FirstView, codec: m.CodecName, u: float, v: float, pace: str
+) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, u, v, texture_db=34, range_mm=0.05)
-    update = plan_update(scan, viewer.state, look, codec)
+    model = None if pace == "unknown" else RangeModel(scan.spec, scan.range_steps, scan.filled)
+    update = plan_update(scan, viewer.state, look, codec, range_model=model, hurried=pace == "hurried")
     viewer.take(update)
     assert update.reason == "complete"
     assert viewer.range_error_mm(look) <= look.range_mm
@@ -179,6 +187,33 @@ def test_texture_is_never_made_worse(head: tuple[Scan, TextureModel]) -> None:
             viewer = Viewer(scan, view)
             viewer.take(plan_update(scan, viewer.state, look, "htj2k", budget, model=model))
             assert viewer.texture_db(look) >= before
+
+
+def test_what_is_known_of_range_spares_trials_and_a_hurry_spares_more(
+    head: tuple[Scan, TextureModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan, model = head
+    state = build_first_view(scan, "htj2k", 32768).state
+    known = RangeModel(scan.spec, scan.range_steps, scan.filled)
+    trials: list[refine_range.Trial] = []
+
+    class Counted(refine_range.Trial):
+        def __init__(self, *of: Any) -> None:
+            super().__init__(*of)
+            trials.append(self)
+
+    monkeypatch.setattr(refine_range, "Trial", Counted)
+    counted, size_bytes = [], []
+    paces: tuple[dict[str, Any], ...] = {}, {"range_model": known}, {"range_model": known, "hurried": True}
+    for pace in paces:
+        trials.clear()
+        updates = [plan_update(scan, state, Look(1, u, 0.5), "htj2k", model=model, **pace) for u in TURN]
+        counted.append(len(trials))
+        size_bytes.append(sum(update.wire_bytes for update in updates))
+    free, spared, hurried = counted
+    assert 0 == hurried < spared < free
+    assert size_bytes[1] <= 1.01 * size_bytes[0]
+    assert size_bytes[2] <= 1.15 * size_bytes[0]
 
 
 def test_the_same_look_twice_sends_nothing(scan: Scan, view: FirstView) -> None:
