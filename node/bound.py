@@ -106,7 +106,7 @@ class Bound:
             }
         except LatticeError as error:
             raise RemoteWireError(f"holdings: {error}") from None
-        self.state.take_word(channels)
+        self.state = self.state.as_said(channels)
 
 
 def choose_codec(codecs: Sequence[m.CodecName], scan: Scan, look: m.Look, model: TextureModel | None) -> m.CodecName:

@@ -48,10 +48,6 @@ class ClassicState:
     holdings: Foveae = Foveae()
     looks: int = 0
 
-    def copy(self) -> ClassicState:
-        """Itself, since it never changes."""
-        return self
-
     def at(self, next_seq: int) -> ClassicState:
         """The state of a client that waits for next_seq. Raises LatticeError where it cannot be there."""
         return replace(self, holdings=self.holdings.first(next_seq - FIRST_VIEW_REFINEMENTS))

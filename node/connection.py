@@ -278,7 +278,7 @@ class Connection:
             if scan.spec.geometry not in self._geometries:
                 raise LibraryError(f"scan {scan.id} is a {scan.spec.geometry}, which this client cannot show")
             self._epoch = (self._epoch + 1) & 0xFFFF
-            bound = Bound(self._epoch, scan, view.state.copy())
+            bound = Bound(self._epoch, scan, view.state)
             if wanted.holdings is not None:
                 bound.adopt_holdings(wanted.holdings)
         except LibraryError as error:

@@ -25,6 +25,8 @@ class ClientState:
         target_steps, (blocks_y, blocks_x) float32; infinite where the bits mean nothing.
     missed : (texture blocks_y, blocks_x) float32 squared error per value left in each block; NaN where not measured.
     first_error : as error, with the first view alone; shared between copies.
+
+    Clients share states until they differ: whoever changes one makes a copy first.
     """
 
     shapes: dict[Channel, ChannelShape]
@@ -40,20 +42,25 @@ class ClientState:
         arrays = self.error.copy(), self.far.copy(), self.target_steps.copy(), self.missed.copy()
         return ClientState(self.shapes, self.holdings.copy(), *arrays, self.first_error)
 
-    def take_word(self, channels: dict[Channel, ChannelHoldings]) -> None:
-        """Believe a client's own statement of what it holds.
+    def as_said(self, channels: dict[Channel, ChannelHoldings]) -> ClientState:
+        """The state of a client that states what it holds; shares the arrays in which nothing is news.
 
         Blocks that it holds as we thought keep their known errors. Of others, level 0 is off by half a quantum at most;
         anything else is taken for as bad as the first view.
         """
         ours, theirs = self.holdings.channels[Channel.RANGE], channels[Channel.RANGE]
         other = (ours.level != theirs.level) | (ours.rank != theirs.rank)
-        bound = np.where(theirs.level == 0, (65535 - theirs.rank.astype(np.int64)) // 2, self.first_error)
-        self.error[other] = bound[other].astype(np.uint16)
-        self.target_steps[other] = np.inf
+        error, target_steps, missed = self.error, self.target_steps, self.missed
+        if other.any():
+            bound = np.where(theirs.level == 0, (65535 - theirs.rank.astype(np.int64)) // 2, self.first_error)
+            error = np.where(other, bound, error).astype(np.uint16)
+            target_steps = np.where(other, np.float32(np.inf), target_steps)
         held, said = self.holdings.channels[Channel.TEXTURE], channels[Channel.TEXTURE]
-        self.missed[(held.level != said.level) | (held.rank != said.rank)] = np.nan
-        self.holdings = Holdings(channels)
+        unknown = (held.level != said.level) | (held.rank != said.rank)
+        if unknown.any():
+            missed = np.where(unknown, np.float32(np.nan), missed)
+        agreed = {Channel.RANGE: theirs if other.any() else ours, Channel.TEXTURE: said if unknown.any() else held}
+        return ClientState(self.shapes, Holdings(agreed), error, self.far, target_steps, missed, self.first_error)
 
     def cells_beyond(self, target_steps: float, region: Region) -> IntArray:
         """At most how many cells of each block that a region touches lie in it and are further off than target_steps.
