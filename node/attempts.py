@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
+from functools import lru_cache
 from ipaddress import IPv6Address, ip_address, ip_network
 
 ADDRESSES_MAX = 4096
@@ -31,6 +32,7 @@ class Attempts:
             self._failures.popitem(last=False)
 
 
+@lru_cache(maxsize=ADDRESSES_MAX)
 def place_of_address(address: str) -> str:
     """What an address counts as: all that one subscriber has of IPv6 are one."""
     try:

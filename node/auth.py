@@ -13,6 +13,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 from aiohttp import web
@@ -182,6 +183,7 @@ def _changes(request: web.Request) -> bool:
     return request.method not in SAFE or "Upgrade" in request.headers
 
 
+@lru_cache(maxsize=64)
 def _is_loopback_name(host: str) -> bool:
     """Whether a Host header names this machine itself: else a page whose name leads here would be let in."""
     try:

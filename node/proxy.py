@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
 from aiohttp import web
@@ -37,6 +38,7 @@ def _client(headers: list[str], trusted: frozenset[Address]) -> Address | None:
     return None
 
 
+@lru_cache(maxsize=256)
 def _parsed(text: str) -> Address | None:
     try:
         address = ip_address(text)
