@@ -20,11 +20,12 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
 
 from exchange.native import NOTE_MAX
 from node.durable import decode_kept, read_bounded, sync_folder, write_whole
@@ -145,10 +146,18 @@ def decode_record(data: bytes) -> Record:
 def read_grid(folder: Path, spec: GridSpec) -> Grid:
     """A scan's samples, mapped read-only. Raises LibraryError when they are not what its geometry says."""
     try:
-        range_steps, texture = open_memmap(folder / RANGE_FILE, mode="r"), open_memmap(folder / TEXTURE_FILE, mode="r")
+        range_steps, texture = (_mapped(folder / name) for name in (RANGE_FILE, TEXTURE_FILE))
         return Grid(spec, range_steps, texture, _read_repairs(folder / REPAIRS_FILE))
     except (OSError, ValueError, EOFError) as error:
         raise LibraryError(f"its samples cannot be read: {error}") from error
+
+
+def _mapped(path: Path) -> NDArray[Any]:
+    """An array in a file, read-only; as a plain array, since each part taken of a memmap costs a memmap's making.
+
+    Raises OSError, ValueError, EOFError.
+    """
+    return np.asarray(open_memmap(path, mode="r"))
 
 
 def _read_repairs(path: Path) -> RepairArray:

@@ -151,11 +151,12 @@ class TextureModel:
         """
         measured = self._measured[codec, p]
         left, top, wide, high = region.blocks(CELL)
-        place = slice(None), slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
         among = region.touched(CELL) if among is None else among
-        mse, content = measured.mse[place][:, among], measured.content[place][:, among]
+        columns = (np.arange(left, left + wide) % self._cells[1])[None, :]
+        cells = (np.arange(top, top + high)[:, None] * self._cells[1] + columns)[among]
+        mse, content = (of.reshape(len(of), -1).take(cells, 1) for of in (measured.mse, measured.content))
         size_bytes = content.sum(axis=1, dtype=np.float64) + measured.constant
-        log_mse = np.log(np.maximum(mse.mean(axis=1, dtype=np.float64), MSE_MIN)) if among.any() else 0 * size_bytes
+        log_mse = np.log(np.maximum(mse.mean(axis=1, dtype=np.float64), MSE_MIN)) if cells.size else 0 * size_bytes
         return Expected(measured.qualities, log_mse, np.log(np.maximum(size_bytes * measured.bias, 1.0)))
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:

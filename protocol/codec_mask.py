@@ -64,9 +64,10 @@ def _edge_numbers(mask: BoolArray) -> IntArray:
         paths = columns[used : used + high * count].reshape(band)
         used += high * count
         heads.append(band)
-        firsts.append(np.diff(paths[0], prepend=0))
-        moves.append(_to_unsigned(np.diff(paths, axis=0)).T.ravel())
-    return np.concatenate([np.ravel(heads), *firsts, *moves])
+        firsts.append(paths[0, :1])
+        firsts.append(paths[0, 1:] - paths[0, :-1])
+        moves.append((paths[1:] - paths[:-1]).T.ravel())
+    return np.concatenate([np.ravel(heads), *firsts, _to_unsigned(np.concatenate(moves))])
 
 
 def _mask_from_edges(numbers: IntArray, shape: tuple[int, int]) -> BoolArray:

@@ -48,7 +48,7 @@ def test_a_kept_scan_is_the_same_after_a_restart(tmp_path: Path) -> None:
 
 def test_samples_of_a_scan_are_mapped_and_everything_is_read_only(tmp_path: Path) -> None:
     scan = Library(tmp_path).add(noise(0), ABOUT)
-    assert isinstance(scan.range_steps, np.memmap) and isinstance(scan.texture, np.memmap)
+    assert isinstance(scan.range_steps.base, np.memmap) and isinstance(scan.texture.base, np.memmap)
     steps = [scan.range_steps, scan.filled, scan.coarse.range_steps, scan.coarse.filled]
     images = [scan.texture, scan.coarse.texture, *scan.pyramid]
     assert not any(array.flags.writeable for array in steps)
