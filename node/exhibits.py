@@ -44,7 +44,7 @@ class Exhibits:
         self._way = way or RightOfWay()
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, "encode", _give_way)
-        self._turns, self._waiting = asyncio.Semaphore(workers), 0
+        self._turns, self._waiting = asyncio.Semaphore(workers + 1), 0
         self._workers = workers
         self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0
@@ -100,7 +100,7 @@ class Exhibits:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[bool]:
-        """Inside it is the caller's turn to plan a look: first come, first served, one for each thread at once.
+        """Inside it is the caller's turn to plan a look: first come, first served, one for each thread and one to follow.
 
         Whether that is pressing: so many wait that nobody would be served soon if each look were given its full time.
         """

@@ -29,14 +29,14 @@ async def test_a_turn_presses_while_many_wait_behind_it(exhibits: Exhibits, more
             pressed.append(is_pressing)
             await go_on.wait()
 
-    plans = [asyncio.create_task(plan(number)) for number in range(3 + more)]
-    while len(begun) < 2:
+    plans = [asyncio.create_task(plan(number)) for number in range(4 + more)]
+    while len(begun) < 3:
         await asyncio.sleep(0)
-    assert begun == [0, 1]
+    assert begun == [0, 1, 2]  # two threads, and one look that is ready when either is
     go_on.set()
     await asyncio.gather(*plans)
-    assert begun == list(range(3 + more))
-    assert pressed[2] == (more >= 2 * PRESSING)
+    assert begun == list(range(4 + more))
+    assert pressed[3] == (more >= 2 * PRESSING)
     assert not pressed[-1]
 
 
@@ -45,7 +45,7 @@ async def test_who_gives_up_waiting_is_not_waited_for(exhibits: Exhibits) -> Non
         async with exhibits.turn():
             raise AssertionError("nobody gave a turn")
 
-    async with exhibits.turn(), exhibits.turn():
+    async with exhibits.turn(), exhibits.turn(), exhibits.turn():
         waiting = [asyncio.create_task(wait()) for _ in range(2 * PRESSING + 1)]
         await asyncio.sleep(0)
         for one in waiting:
