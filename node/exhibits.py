@@ -100,7 +100,7 @@ class Exhibits:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[bool]:
-        """Inside it is the caller's turn to plan a look: first come, first served, one for each thread and one to follow.
+        """Inside it is the caller's turn to plan a look: first come, first served, one for each thread and one more.
 
         Whether that is pressing: so many wait that nobody would be served soon if each look were given its full time.
         """
