@@ -25,6 +25,7 @@ VIEWS_MAX = 8
 GIVES_WAY = 10  # niceness of threads that compute for clients: a scanner does not wait
 MODELS_MAX = 8
 PRESSING = 2  # looks that wait for each thread
+PAUSE_S = 0.02  # between two of a thousand tiles: a survey takes 20 s longer at most
 T = TypeVar("T")
 Work = Literal["look", "fovea", "view", "other"]
 Key = tuple[str, CodecName, Profile]
@@ -166,10 +167,17 @@ class Exhibits:
 
     def _texture_model(self, scan: Scan, view: FirstView) -> TextureModel:
         def is_over() -> bool:
+            self._let_looks_go_first()
             with self._way.given():
                 return self._closing.is_set()
 
         return TextureModel(scan.texture, texture_as_seen(view), is_over)
+
+    def _let_looks_go_first(self) -> None:
+        """Pause for a moment while looks wait: what is measured serves those to come."""
+        until_s = time.monotonic() + PAUSE_S
+        while self._waiting and time.monotonic() < until_s:
+            time.sleep(PAUSE_S / 8)
 
     def _build(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening:
         scan = self.library.open(scan_id)
