@@ -39,22 +39,22 @@ class Looked:
 @asynccontextmanager
 async def node_with(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[Session, dict[str, str]]]:
     """A session with a running node, and the id of each scan by its key."""
-    async with node_at(scans) as (_, session, ids):
+    async with node_at(scans) as (_, _, session, ids):
         yield session, ids
 
 
 @asynccontextmanager
-async def node_at(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[str, Session, dict[str, str]]]:
-    """The same, and where it is."""
+async def node_at(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[str, int, Session, dict[str, str]]]:
+    """The same, and before them where the node is and its process id."""
     with tempfile.TemporaryDirectory(prefix="foveascan-bench-") as folder:
         ids = {scan.key: scan.published(Path(folder)).id for scan in scans}
         arguments = ("serve", "--library", folder, "--listen", "127.0.0.1:0", "--insecure", "--json")
-        with foveascan.started(*arguments) as (_, ready):
+        with foveascan.started(*arguments) as (program, ready):
             async with connect(ready["url"]) as session:
                 for scan_id in ids.values():
                     await session.open(scan_id)
                 await _surveyed(ready["url"])
-                yield ready["url"], session, ids
+                yield ready["url"], program.pid, session, ids
 
 
 async def _surveyed(url: str) -> None:

@@ -1,7 +1,9 @@
 // Injected before a page's own scripts: notes in `window.bench` when frames are finished by the renderer, how long
-// messages of workers and frames keep the page's thread, and its long tasks. Changes nothing that a page does.
+// messages of workers and frames keep the page's thread, its long tasks, and when what a picture needs was there first.
+// Changes nothing that a page does.
 (() => {
-  const bench = (window.bench = { frames: [], messages: [], painting: [], tasks: [], clicked: null });
+  const bench = (window.bench = { frames: [], messages: [], painting: [], tasks: [], first: {}, clicked: null, answer: null });
+  const first = (name) => (bench.first[name] ??= performance.now());
   const timed = (note, work) => {
     const begin = performance.now();
     try {
@@ -22,13 +24,22 @@
     timed((ms) => bench.painting.push([at, ms]), () => paint(now));
   });
 
+  const say = Worker.prototype.postMessage;
+  Worker.prototype.postMessage = function (message, ...more) {
+    first('worker');
+    if (message.kind === 'look') bench.looked = performance.now();
+    return say.call(this, message, ...more);
+  };
   const { get, set } = Object.getOwnPropertyDescriptor(Worker.prototype, 'onmessage');
   Object.defineProperty(Worker.prototype, 'onmessage', {
     get,
     set(hear) {
       set.call(this, (event) => {
-        const at = performance.now();
-        timed((ms) => bench.messages.push([event.data.kind, at, ms]), () => hear.call(this, event));
+        const [at, { kind, link, answer }] = [performance.now(), event.data];
+        if (link?.state === 'ready') first('stream');
+        if (kind === 'opened') first('view');
+        if (answer) bench.answer = answer;
+        timed((ms) => bench.messages.push([kind, at, ms]), () => hear.call(this, event));
       });
     },
   });
@@ -48,6 +59,12 @@
     const gl = context.call(this, kind, ...more);
     if (kind !== 'webgl2' || !gl || gl.benched) return gl;
     gl.benched = true;
+    first('context');
+    const link = gl.linkProgram;
+    gl.linkProgram = function (program) {
+      first('program');
+      return link.call(this, program);
+    };
     let frame = null;
     const note = (work) => {
       if (!frame) {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import foveascan
-from tests.bench import alpha, codec, line, page, plots, rate, roi, sphere
+from tests.bench import alpha, codec, line, page, page_memory, plots, rate, roi, sphere
 from tests.bench.cache import Cache
 from tests.bench.rivals.offer import straight
 from tests.bench.scans import BenchScan, load
@@ -61,7 +61,7 @@ def test_the_page_is_measured_beside_an_empty_one(scan: BenchScan) -> None:
     record = asyncio.run(page.run(scan, 2, 1, 1.0))
     assert record["first"]["ms"] > 0 < record["first"]["empty_ms"]
     assert record["click"]["count"]
-    assert len(record["memory"]["mb"]["renderer process"]) == page.ROUNDS + 1
+    assert len(record["memory"]["mb"]["page process"]) == page_memory.ROUNDS + 1
     assert page.told(record)
 
 

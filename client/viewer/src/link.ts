@@ -47,6 +47,8 @@ export interface Answer {
   reason: 'complete' | 'byte limit' | 'superseded';
   bytes: number;
   elapsedMs: number;
+  /** Of that, what the node took to make it, by its own account, and what taking it in took here. */
+  nodeMs: number;
   applyMs: number;
   errorMaxMm: number | null;
   textureDb: number | null;

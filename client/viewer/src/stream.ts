@@ -266,7 +266,7 @@ export class Stream {
     const [errorMaxMm, textureDb] = [said?.errorMaxMm ?? null, said?.textureDb ?? null];
     const elapsedMs = performance.now() - began;
     this.tellPatches();
-    this.tell({ kind: 'updated', answer: { look: look.request, reason, bytes, elapsedMs, applyMs, errorMaxMm, textureDb } });
+    this.tell({ kind: 'updated', answer: { look: look.request, reason, bytes, elapsedMs, nodeMs: said?.nodeMs ?? 0, applyMs, errorMaxMm, textureDb } });
   }
 
   private sendOpen(): void {
