@@ -30,8 +30,8 @@ export interface Boot {
   context: WebGL2RenderingContext | null;
 }
 
-/** Edges are smooth because the picture is drawn larger than shown. */
-export const CONTEXT: WebGLContextAttributes = { antialias: false, powerPreference: 'high-performance' };
+/** Edges are smooth because the picture is drawn larger than shown. It is kept, so that a part of it can be drawn anew. */
+export const CONTEXT: WebGLContextAttributes = { antialias: false, preserveDrawingBuffer: true, powerPreference: 'high-performance' };
 
 /** A scan as it is known now; texels that are refined follow as patches. */
 export interface Snapshot {

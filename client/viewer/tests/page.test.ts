@@ -6,7 +6,11 @@ import { formatState, parseState } from '../src/url_state.ts';
 import { evened } from '../src/view/coarse_colours.ts';
 import { boundsOf, fittingDistance } from '../src/view/framing.ts';
 import { locate, pick } from '../src/view/pick.ts';
+import { joined, partOf, within } from '../src/view/repaint.ts';
+import type { Part } from '../src/view/repaint.ts';
+import { pointAt } from '../src/view/room.ts';
 import { STRIDES, Tiles } from '../src/view/tiles.ts';
+import type { Batch, Detail } from '../src/view/tiles.ts';
 
 const INFO = {
   id: 'a', width: 360, height: 200, textureWidth: 720, textureHeight: 400, coarseWidth: 45, coarseHeight: 25,
@@ -14,6 +18,20 @@ const INFO = {
 };
 const TILE = 64;
 const SPHERE = { ...INFO, geometry: 'sphere' as const };
+/** A camera that looks at the middle from the side where x is less. */
+function fromTheSide(): PerspectiveCamera {
+  const camera = new PerspectiveCamera(28, 1, 1, 1000);
+  camera.position.set(-500, 0, 0);
+  camera.lookAt(0, 0, 0);
+  camera.updateMatrixWorld();
+  return camera;
+}
+
+function chosen(tiles: Tiles, camera: PerspectiveCamera, detail: Detail): Batch[] {
+  tiles.choose(camera, 700, detail);
+  return tiles.batches(camera);
+}
+
 const alike = (radiusMm: number) => new Uint16Array(INFO.width * INFO.height).fill(radiusMm / INFO.stepMm);
 
 test('an address holds a view, and nonsense in it is left out', () => {
@@ -83,7 +101,7 @@ test('a sphere is closed over its poles by a fan for each tile beside them', () 
   const camera = new PerspectiveCamera(120, 1, 1, 1000);
   camera.position.set(0, SPHERE.zMaxMm, 120);
   camera.updateMatrixWorld();
-  const { batches } = tiles.choose(camera, 700, { cellPx: 1, awayFactor: 1, trianglesMax: 1e6, tileSide: TILE });
+  const batches = chosen(tiles, camera, { cellPx: 1, awayFactor: 1, trianglesMax: 1e6, tileSide: TILE });
   const fans = batches.flatMap(({ fans }) => fans.filter((_, at) => at % 2 === 0).map((column, at) => `${column} ${fans[2 * at + 1]}`));
   const columns = Array.from({ length: Math.ceil(INFO.width / TILE) }, (_, at) => at * TILE);
   assert.deepEqual(fans.sort(), columns.flatMap((column) => [`${column} 0`, `${column} 1`]).sort());
@@ -112,12 +130,9 @@ test('everything fits the picture, however narrow', () => {
 test('what is turned away is drawn with fewer triangles, and what is not with as many', () => {
   const tiles = new Tiles(INFO, TILE);
   tiles.update(alike(50), new Uint8Array(45 * 25));
-  const camera = new PerspectiveCamera(28, 1, 1, 1000);
-  camera.position.set(-500, 0, 0);
-  camera.lookAt(0, 0, 0);
-  camera.updateMatrixWorld();
+  const camera = fromTheSide();
   const strides = (awayFactor: number): Map<string, number> => {
-    const { batches } = tiles.choose(camera, 700, { tileSide: TILE, cellPx: 4, awayFactor, trianglesMax: 1e6 });
+    const batches = chosen(tiles, camera, { tileSide: TILE, cellPx: 4, awayFactor, trianglesMax: 1e6 });
     return new Map(batches.flatMap(({ corners }, index) => Array.from({ length: corners.length / 2 }, (_, k) => [`${corners[2 * k]},${corners[2 * k + 1]}`, STRIDES[index]!])));
   };
   const [all, fewer] = [strides(1), strides(4)];
@@ -130,14 +145,34 @@ test('what is turned away is drawn with fewer triangles, and what is not with as
   }
 });
 
+test('the part of the picture that shows cells holds all of them, and little else', () => {
+  const camera = fromTheSide();
+  const steps = alike(50);
+  const facing = INFO.width * (0.5 - INFO.theta0Rad / (2 * Math.PI)); // the column at -x
+  const cells = { x: Math.round(facing) - 20, y: 80, width: 40, height: 40 };
+  const part = partOf(INFO, steps, cells, camera, 700, 700) as Part;
+  for (let row = cells.y; row < cells.y + cells.height; row += 3) {
+    for (let column = cells.x; column < cells.x + cells.width; column += 3) {
+      const seen = pointAt(INFO, { u: (column + 0.5) / INFO.width, v: (row + 0.5) / INFO.height }, 50).project(camera);
+      const [x, y] = [350 * (seen.x + 1), 350 * (1 - seen.y)];
+      assert.ok(x > part.left && x < part.right && y > part.top && y < part.bottom);
+    }
+  }
+  assert.ok(part.right - part.left < 110 && part.bottom - part.top < 130, JSON.stringify(part));
+  assert.equal(partOf(INFO, new Uint16Array(steps.length), cells, camera, 700, 700), null);
+  camera.position.set(-40, 0, 0);
+  camera.updateMatrixWorld();
+  assert.equal(partOf(INFO, steps, cells, camera, 700, 700), 'all', 'some of it is behind the camera');
+  assert.deepEqual(joined({ left: 0, top: 5, right: 2, bottom: 6 }, { left: 1, top: 1, right: 9, bottom: 2 }), { left: 0, top: 1, right: 9, bottom: 6 });
+  assert.deepEqual(within({ left: -3, top: 1.5, right: 9.2, bottom: 99 }, 50, 60), { left: 0, top: 1, right: 10, bottom: 60 });
+  assert.equal(within({ left: 60, top: 0, right: 70, bottom: 9 }, 50, 60), null);
+});
+
 test('neighbouring tiles share every vertex of their border', () => {
   const tiles = new Tiles(INFO, TILE);
   tiles.update(alike(50), new Uint8Array(45 * 25).map((_, block) => (block % 45 < 24 ? 0 : 6)));
-  const camera = new PerspectiveCamera(28, 1, 1, 1000);
-  camera.position.set(-500, 0, 0);
-  camera.lookAt(0, 0, 0);
-  camera.updateMatrixWorld();
-  const { batches } = tiles.choose(camera, 700, { tileSide: TILE, cellPx: 1, awayFactor: 4, trianglesMax: 1e6 });
+  const camera = fromTheSide();
+  const batches = chosen(tiles, camera, { tileSide: TILE, cellPx: 1, awayFactor: 4, trianglesMax: 1e6 });
   assert.ok(batches.filter(({ corners }) => corners.length).length > 1, 'several strides are drawn');
   const drawn = new Map<string, { stride: number; right: number; left: number }>();
   batches.forEach(({ corners, edges }, index) => {

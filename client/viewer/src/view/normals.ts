@@ -11,7 +11,7 @@ import type { Uniforms } from './grid_mesh.ts';
 import { COPY_FRAGMENT, definesOf, NORMALS_FRAGMENT, QUAD_VERTEX } from './shaders.ts';
 
 /** Differences of a normal reach this far beyond the samples that changed. */
-const REACH = 24;
+export const NORMALS_REACH = 24;
 
 type Rectangle = Omit<Changed, 'cells'>;
 
@@ -77,7 +77,7 @@ export class Normals {
   }
 
   private draw({ x, y, width, height }: Rectangle): void {
-    const [top, bottom] = [Math.max(0, y - REACH), Math.min(this.height, y + height + REACH)];
+    const [top, bottom] = [Math.max(0, y - NORMALS_REACH), Math.min(this.height, y + height + NORMALS_REACH)];
     const reach = this.reachRound(top, bottom);
     const [left, right] = [Math.max(0, x - reach), Math.min(this.width, x + width + reach)];
     this.render(this.pass, left, top, right, bottom);
@@ -87,9 +87,9 @@ export class Normals {
 
   /** The same round: on a sphere, columns of these rows are as narrow as the ring next to a pole is short. */
   private reachRound(top: number, bottom: number): number {
-    if (!this.sphere) return REACH;
+    if (!this.sphere) return NORMALS_REACH;
     const ring = Math.min(Math.sin((Math.PI * top) / this.height), Math.sin((Math.PI * bottom) / this.height));
-    return Math.min(Math.ceil(REACH / Math.max(ring, 1e-6)), this.width);
+    return Math.min(Math.ceil(NORMALS_REACH / Math.max(ring, 1e-6)), this.width);
   }
 
   dispose(): void {

@@ -11,6 +11,8 @@ import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
 import { locate, pick } from './pick.ts';
 import { geometryOf, isSphere } from './room.ts';
 import type { Geometry, Place } from './room.ts';
+import { within as inside, joined } from './repaint.ts';
+import type { Part } from './repaint.ts';
 import { Surface } from './surface.ts';
 import type { Shading } from './surface.ts';
 import type { Detail } from './tiles.ts';
@@ -63,6 +65,8 @@ export class Stage {
   private shading: Shading = 'lit';
   private overlay: Channel | null = null;
   private asked = false;
+  /** What is to be drawn anew. */
+  private due: Part | 'all' | null = 'all';
   private moving = false;
   private pace = 1;
   /** The last picture was drawn more coarsely than could be, to keep up. */
@@ -117,8 +121,16 @@ export class Stage {
 
   /** Take rectangles that have changed. */
   patch(channel: Channel, changed: Changed[], level: Uint8Array): void {
+    const before = this.partOf(channel, changed);
     this.surface?.patch(channel, changed, level);
-    this.draw();
+    const after = this.partOf(channel, changed);
+    this.draw(before === 'all' || after === 'all' ? 'all' : joined(before, after));
+  }
+
+  /** The part of the picture that shows these samples; where a graphics card draws, all is as soon drawn. */
+  private partOf(channel: Channel, changed: Changed[]): Part | 'all' | null {
+    if (!this.surface || !this.software) return 'all';
+    return this.surface.seenAt(channel, changed, this.camera, this.canvas.clientWidth, this.canvas.clientHeight);
   }
 
   /** Show a newer picture of a running sweep. */
@@ -265,7 +277,8 @@ export class Stage {
     if (!this.warming.has(geometry)) return; // the card was lost meanwhile
     this.smallest.set(geometry, smallest);
     if (!this.surface) {
-      smallest.prepare(this.camera, 1, this.detail);
+      smallest.choose(this.camera, 1, this.detail);
+      smallest.prepare(this.camera);
       this.renderer.render(smallest.object, this.camera);
     }
     this.draw();
@@ -279,8 +292,9 @@ export class Stage {
     return new Surface(this.renderer, info, state, !this.software, this.detail.tileSide);
   }
 
-  /** Ask for a picture; any number of calls make one. */
-  draw(): void {
+  /** Ask for a picture, or to have a part of it drawn anew; any number of calls make one. */
+  draw(part: Part | 'all' | null = 'all'): void {
+    this.due = part === 'all' || this.due === 'all' ? 'all' : joined(this.due, part);
     if (this.asked || !this.isWarm) return;
     this.asked = true;
     requestAnimationFrame((nowMs) => this.paint(nowMs));
@@ -290,7 +304,9 @@ export class Stage {
     this.asked = false;
     if (!this.isWarm) return;
     if (this.controls.enableDamping) this.controls.update();
+    if (!this.due) return;
     this.keepPace(nowMs);
+    const wasHasty = this.isHasty;
     this.isHasty = this.moving && this.pace > 1;
     const detail = this.isHasty ? { ...this.detail, cellPx: this.detail.cellPx * this.pace } : this.detail;
     const distance = this.camera.position.distanceTo(this.controls.target);
@@ -299,14 +315,33 @@ export class Stage {
     this.camera.updateProjectionMatrix();
     this.camera.updateMatrixWorld();
     const ratio = this.renderer.getPixelRatio();
-    const triangles = this.surface?.prepare(this.camera, this.canvas.clientHeight * ratio, detail) ?? 0;
-    this.renderer.render(this.scene, this.camera);
+    const isOther = this.surface?.choose(this.camera, this.canvas.clientHeight * ratio, detail) ?? true;
+    const triangles = this.drawPart(isOther || this.isHasty || wasHasty ? 'all' : this.due);
+    this.due = null;
     clearTimeout(this.leisure);
     this.leisure = setTimeout(() => void this.useLeisure(), LEISURE_MS);
     const { dataset } = this.canvas;
     dataset['drawn'] = String(Number(dataset['drawn'] ?? 0) + 1);
     dataset['triangles'] = String(triangles);
     this.events.drawn();
+  }
+
+  /** Draw, or draw a part anew. Returns how many triangles. */
+  private drawPart(due: Part | 'all'): number {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const part = due === 'all' ? null : inside(due, width, height);
+    if (due !== 'all' && !part) return 0;
+    const camera = part ? this.camera.clone() : this.camera;
+    if (part) {
+      const [wide, high] = [part.right - part.left, part.bottom - part.top];
+      camera.setViewOffset(width, height, part.left, part.top, wide, high);
+      this.renderer.setScissor(part.left, height - part.bottom, wide, high);
+    }
+    this.renderer.setScissorTest(part !== null);
+    const triangles = this.surface?.prepare(camera) ?? 0;
+    this.renderer.render(this.scene, this.camera);
+    this.renderer.setScissorTest(false);
+    return triangles;
   }
 
   /** While the camera moves, draw as coarsely as it takes to keep up with it. */

@@ -14,7 +14,9 @@ import { evened } from './coarse_colours.ts';
 import { compile } from './compile.ts';
 import { fan, fill, gridMesh, tileGrid } from './grid_mesh.ts';
 import type { Uniforms } from './grid_mesh.ts';
-import { Normals } from './normals.ts';
+import { Normals, NORMALS_REACH } from './normals.ts';
+import { joined, partOf } from './repaint.ts';
+import type { Part } from './repaint.ts';
 import { isSphere } from './room.ts';
 import { STRIDES, Tiles } from './tiles.ts';
 import type { Detail } from './tiles.ts';
@@ -43,7 +45,7 @@ export class Surface {
 
   constructor(
     private readonly renderer: WebGLRenderer, readonly info: ScanInfo, snapshot: Omit<Snapshot, 'info'>,
-    private readonly mipmaps: boolean, tileSide: number,
+    private readonly mipmaps: boolean, private readonly tileSide: number,
   ) {
     const { width, height } = info;
     const most = renderer.capabilities.maxTextureSize;
@@ -119,15 +121,41 @@ export class Surface {
     (this.uniforms['uLevelScale']!.value as Vector2).set(scale[0]!, scale[1]!);
   }
 
-  /** Choose tiles for a camera and light them from it. Returns the triangles to be drawn. */
-  prepare(camera: PerspectiveCamera, sidePx: number, detail: Detail): number {
+  /** Choose how finely tiles are drawn for a camera. Returns whether any is drawn otherwise than before. */
+  choose(camera: PerspectiveCamera, sidePx: number, detail: Detail): boolean {
+    return this.tiles.choose(camera, sidePx, detail);
+  }
+
+  /** Draw what a camera sees, perhaps one of a part of the picture, lit from it. Returns the triangles to be drawn. */
+  prepare(camera: PerspectiveCamera): number {
     this.normals.drawDue();
-    const { batches, triangles } = this.tiles.choose(camera, sidePx, detail);
+    const batches = this.tiles.batches(camera);
+    const triangles = batches.reduce((sum, { corners }, index) => sum + corners.length * (this.tileSide / STRIDES[index]!) ** 2, 0);
     this.meshes.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.corners, batches[index]!.edges));
     this.fans.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.fans, []));
     (this.uniforms['uKey']!.value as Vector3).set(-0.45, 0.55, 0.8).normalize().transformDirection(camera.matrixWorld);
     (this.uniforms['uFill']!.value as Vector3).set(0.8, 0.05, 0.45).normalize().transformDirection(camera.matrixWorld);
     return triangles;
+  }
+
+  /** Where rectangles of a channel are seen in a picture, as far as they change it; 'all' where that is not known. */
+  seenAt(channel: Channel, changed: Changed[], camera: PerspectiveCamera, width: number, height: number): Part | 'all' | null {
+    if (isSphere(this.info)) return 'all';
+    let part: Part | null = null;
+    for (const rectangle of changed) {
+      const cells = channel === RANGE ? grown(rectangle, NORMALS_REACH) : this.cellsOf(rectangle);
+      const seen = partOf(this.info, this.steps, grown(cells, 2 * this.tiles.coarsest(grown(cells, STRIDES.at(-1)!))), camera, width, height);
+      if (seen === 'all') return seen;
+      part = joined(part, seen);
+    }
+    return part;
+  }
+
+  /** The range cells under texels. */
+  private cellsOf({ x, y, width, height }: Changed): Omit<Changed, 'cells'> {
+    const [across, down] = [this.info.width / this.info.textureWidth, this.info.height / this.info.textureHeight];
+    const [left, top] = [Math.floor(x * across) - 1, Math.floor(y * down) - 1];
+    return { x: left, y: top, width: Math.ceil((x + width) * across) + 1 - left, height: Math.ceil((y + height) * down) + 1 - top };
   }
 
   dispose(): void {
@@ -224,6 +252,11 @@ function shrink(cells: Uint8Array, x: number, y: number, width: number, height: 
     }
   }
   return { cells: small, x: left, y: top, width: right - left + 1, height: bottom - top + 1 };
+}
+
+/** A rectangle with so many cells more on all sides. */
+function grown({ x, y, width, height }: Omit<Changed, 'cells'>, by: number): Omit<Changed, 'cells'> {
+  return { x: x - by, y: y - by, width: width + 2 * by, height: height + 2 * by };
 }
 
 /** Samples from one that is held to the next, where they are densest. level: twice the logarithm of that. */

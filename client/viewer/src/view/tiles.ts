@@ -46,6 +46,7 @@ export class Tiles {
   private readonly down: number;
   private readonly stride: Int32Array;
   private readonly frustum = new Frustum();
+  private readonly ball = new Sphere();
 
   /** side: of a tile [samples]; a multiple of 64. */
   constructor(private readonly info: ScanInfo, private readonly side: number) {
@@ -97,21 +98,52 @@ export class Tiles {
     return at(0.5, 1).sub(at(0.5, 0)).cross(at(1, 0.5).sub(at(0, 0.5))).normalize();
   }
 
-  /** Batches by stride index, and the triangles in them. sidePx: height of the picture. */
-  choose(camera: PerspectiveCamera, sidePx: number, detail: Detail): { batches: Batch[]; triangles: number } {
-    this.frustum.setFromProjectionMatrix(new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
+  /** Choose a stride for each tile. sidePx: height of the picture. Returns whether any is another than before. */
+  choose(camera: PerspectiveCamera, sidePx: number, detail: Detail): boolean {
+    this.look(camera);
     const focalPx = sidePx / (2 * Math.tan((camera.fov * Math.PI) / 360));
+    const before = this.stride.slice();
     for (let cellPx = detail.cellPx; ; cellPx *= 1.5) {
       const triangles = this.pick(camera, focalPx, cellPx, detail.awayFactor);
-      if (triangles <= detail.trianglesMax || cellPx > 64 * detail.cellPx) return { batches: this.batches(), triangles };
+      if (triangles <= detail.trianglesMax || cellPx > 64 * detail.cellPx) break;
     }
+    return this.stride.some((stride, index) => stride !== before[index]);
+  }
+
+  /** Batches by stride index of the tiles chosen that a camera sees, perhaps one of a part of the picture. */
+  batches(camera: PerspectiveCamera): Batch[] {
+    this.look(camera);
+    const batches: Batch[] = STRIDES.map(() => ({ corners: [], edges: [], fans: [] }));
+    this.tiles.forEach((tile, index) => {
+      if (this.stride[index] && this.sees(tile)) this.add(batches, tile, index);
+    });
+    return batches;
+  }
+
+  /** The coarsest stride of tiles that these cells touch. */
+  coarsest({ x, y, width, height }: { x: number; y: number; width: number; height: number }): number {
+    let most = 1;
+    for (let row = Math.max(0, Math.floor(y / this.side)); row < Math.min(this.down, Math.ceil((y + height) / this.side)); row++) {
+      for (let column = Math.floor(x / this.side); column < Math.ceil((x + width) / this.side); column++) {
+        most = Math.max(most, this.stride[row * this.across + ((column % this.across) + this.across) % this.across]!);
+      }
+    }
+    return most;
+  }
+
+  private look(camera: PerspectiveCamera): void {
+    this.frustum.setFromProjectionMatrix(new Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
+  }
+
+  private sees({ centre, reachMm }: Tile): boolean {
+    return reachMm > 0 && this.frustum.intersectsSphere(this.ball.set(centre, reachMm));
   }
 
   private pick(camera: PerspectiveCamera, focalPx: number, cellPx: number, awayFactor: number): number {
     let triangles = 0;
-    const [ball, sight] = [new Sphere(), new Vector3()];
+    const sight = new Vector3();
     this.tiles.forEach((tile, index) => {
-      const seen = tile.reachMm > 0 && this.frustum.intersectsSphere(ball.set(tile.centre, tile.reachMm));
+      const seen = this.sees(tile);
       const distance = Math.max(camera.position.distanceTo(tile.centre) - tile.reachMm, camera.near);
       const samplePx = (this.info.pitchMm * focalPx) / distance;
       const isAway = sight.subVectors(tile.centre, camera.position).normalize().dot(tile.outward) > AWAY;
@@ -123,25 +155,20 @@ export class Tiles {
     return triangles;
   }
 
-  private batches(): Batch[] {
-    const batches: Batch[] = STRIDES.map(() => ({ corners: [], edges: [], fans: [] }));
-    this.tiles.forEach((tile, index) => {
-      const stride = this.stride[index]!;
-      if (!stride) return;
-      const [x, y] = [index % this.across, Math.floor(index / this.across)];
-      const beside = (dx: number, dy: number): number => {
-        const row = y + dy;
-        if (row < 0 || row >= this.down) return stride;
-        return Math.max(stride, this.stride[row * this.across + ((x + dx + this.across) % this.across)]!);
-      };
-      const batch = batches[Math.log2(stride)]!;
-      batch.corners.push(tile.column, tile.row);
-      batch.edges.push(beside(-1, 0), beside(1, 0), beside(0, -1), beside(0, 1));
-      if (!isSphere(this.info)) return;
-      if (y === 0) batch.fans.push(tile.column, 0);
-      if (y === this.down - 1) batch.fans.push(tile.column, 1);
-    });
-    return batches;
+  private add(batches: Batch[], tile: Tile, index: number): void {
+    const stride = this.stride[index]!;
+    const [x, y] = [index % this.across, Math.floor(index / this.across)];
+    const beside = (dx: number, dy: number): number => {
+      const row = y + dy;
+      if (row < 0 || row >= this.down) return stride;
+      return Math.max(stride, this.stride[row * this.across + ((x + dx + this.across) % this.across)]!);
+    };
+    const batch = batches[Math.log2(stride)]!;
+    batch.corners.push(tile.column, tile.row);
+    batch.edges.push(beside(-1, 0), beside(1, 0), beside(0, -1), beside(0, 1));
+    if (!isSphere(this.info)) return;
+    if (y === 0) batch.fans.push(tile.column, 0);
+    if (y === this.down - 1) batch.fans.push(tile.column, 1);
   }
 
   private finest(tile: Tile, columns: number, rows: number, level: Uint8Array): number {
