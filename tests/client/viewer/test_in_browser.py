@@ -42,6 +42,25 @@ def test_a_click_sharpens_what_it_is_at(browser: Browser, node: RunningNode) -> 
     assert psnr(sharp, full) >= psnr(coarse, full) + 6
 
 
+def test_a_look_draws_its_part_of_the_picture_as_if_all_were_drawn(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        surface = page.get_by_label("Surface")
+        surface.evaluate("(one) => (one.closest('details').open = true)")
+        surface.select_option("relief")
+        surface.select_option("lit")
+        wait_drawn(page)
+        whole = page.locator("#view").get_attribute("data-triangles")
+        for number, place in enumerate(((0.5, 0.4), (0.44, 0.55)), 1):
+            click(page, *place)
+            wait_updates(page, number)
+        assert int(page.locator("#view").get_attribute("data-triangles") or 0) < int(whole or 0)
+        parts = crop(page, 0.5, 0.5, 500)
+        surface.select_option("relief")
+        surface.select_option("lit")
+        wait_drawn(page)
+        assert np.abs(parts - crop(page, 0.5, 0.5, 500)).max() <= 2
+
+
 def test_nothing_is_seen_through_a_surface_come_near(browser: Browser, node: RunningNode) -> None:
     with opened(browser, node.url) as page:
         page.locator("#view").focus()
