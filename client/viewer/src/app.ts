@@ -81,8 +81,6 @@ export class App {
     addEventListener('hashchange', () => this.addressChanged());
     addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
-    void this.refreshScans();
-    void this.refreshCapture();
     setInterval(() => void this.refreshCapture(), CAPTURE_MS);
   }
 
@@ -125,8 +123,8 @@ export class App {
 
   private linked(link: LinkState): void {
     this.frame.linked(link);
-    if (link.state !== 'ready') return;
-    this.allow(link.role !== 'view');
+    if (link.state === 'connecting') return;
+    if (link.state === 'ready') this.allow(link.role !== 'view');
     void this.refreshScans();
     void this.refreshCapture();
   }

@@ -8,11 +8,12 @@ import type { IUniform } from 'three';
 import { definesOf, SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
 
 export type Uniforms = Record<string, IUniform>;
+export type GridMesh = Mesh<InstancedBufferGeometry, ShaderMaterial>;
 
 /** Instances of a part, at one stride, of a surface whose textures are shared. */
 export function gridMesh(
   { position, index }: Part, stride: number, instances: number, shared: Uniforms, sphere: boolean, isFan = false,
-): Mesh<InstancedBufferGeometry, ShaderMaterial> {
+): GridMesh {
   const geometry = new InstancedBufferGeometry();
   geometry.setAttribute('position', position);
   geometry.setIndex(index);
@@ -49,7 +50,7 @@ export function tileGrid(cells: number): Part {
   const side = cells + 1;
   const position = new Float32Array(3 * side * side);
   const index = new Uint16Array(6 * cells * cells);
-  for (let y = 0, at = 0; y < side; y++) for (let x = 0; x < side; x++, at += 3) position.set([x, y, 0], at);
+  for (let y = 0, at = 0; y < side; y++) for (let x = 0; x < side; x++, at += 3) [position[at], position[at + 1]] = [x, y];
   for (let y = 0, at = 0; y < cells; y++) {
     for (let x = 0; x < cells; x++, at += 6) {
       const a = y * side + x;

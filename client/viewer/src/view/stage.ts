@@ -80,6 +80,7 @@ export class Stage {
   ) {
     this.renderer = new WebGLRenderer({ canvas, context, alpha: true });
     this.renderer.debug.checkShaderErrors = false; // asking waits for the compiler
+    this.renderer.sortObjects = false; // it would measure every vertex
     this.software = drawsInSoftware(context);
     this.detail = this.software ? SOFTWARE : HARDWARE;
     this.renderer.setClearColor(0, 0);

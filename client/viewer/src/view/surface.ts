@@ -1,10 +1,10 @@
 // One scan on the graphics card: range, normals, colour and levels as textures, drawn in tiles.
 
 import {
-  ClampToEdgeWrapping, DataTexture, Group, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, NoColorSpace,
-  RedIntegerFormat, RepeatWrapping, RGBAFormat, ShaderMaterial, UnsignedByteType, UnsignedShortType, Vector2, Vector3,
+  ClampToEdgeWrapping, DataTexture, Group, LinearFilter, LinearMipmapLinearFilter, NearestFilter, NoColorSpace,
+  RedIntegerFormat, RepeatWrapping, RGBAFormat, UnsignedByteType, UnsignedShortType, Vector2, Vector3,
 } from 'three';
-import type { InstancedBufferGeometry, PerspectiveCamera, Texture, WebGLRenderer } from 'three';
+import type { PerspectiveCamera, Texture, WebGLRenderer } from 'three';
 import type { Snapshot } from '../link.ts';
 import { RANGE, TEXTURE } from '../protocol/lattice.ts';
 import type { Channel } from '../protocol/lattice.ts';
@@ -13,7 +13,7 @@ import type { Changed } from '../protocol/model.ts';
 import { evened } from './coarse_colours.ts';
 import { compile } from './compile.ts';
 import { fan, fill, gridMesh, tileGrid } from './grid_mesh.ts';
-import type { Uniforms } from './grid_mesh.ts';
+import type { GridMesh, Uniforms } from './grid_mesh.ts';
 import { Normals, NORMALS_REACH } from './normals.ts';
 import { joined, partOf } from './repaint.ts';
 import type { Part } from './repaint.ts';
@@ -32,9 +32,9 @@ export class Surface {
   /** How many texels of the scan stand for one here, each way, where the graphics card takes no larger texture. */
   readonly shrunk: number;
   private readonly tiles: Tiles;
-  private readonly meshes: Mesh<InstancedBufferGeometry, ShaderMaterial>[];
-  /** What closes a sphere over its poles. */
-  private readonly fans: Mesh<InstancedBufferGeometry, ShaderMaterial>[];
+  /** By stride, made when first drawn; and of a sphere, what closes it over its poles. */
+  private readonly meshes: (GridMesh | undefined)[] = [];
+  private readonly fans: (GridMesh | undefined)[] = [];
   private readonly range: DataTexture;
   private readonly levels: [range: DataTexture, texture: DataTexture];
   private readonly coarse: DataTexture;
@@ -69,17 +69,14 @@ export class Surface {
       uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
     };
     this.tiles = new Tiles(info, tileSide);
-    const sphere = isSphere(info);
-    this.meshes = STRIDES.map((stride) => gridMesh(tileGrid(tileSide / stride), stride, this.tiles.count, this.uniforms, sphere));
-    this.fans = sphere ? STRIDES.map((stride) => gridMesh(fan(tileSide / stride), stride, 2 * this.tiles.across, this.uniforms, true, true)) : [];
-    this.object.add(...this.meshes, ...this.fans);
     this.closePoles();
     this.tiles.update(this.steps, snapshot.levels[0]);
-    this.normals = new Normals(renderer, width, height, this.uniforms, sphere, this.levels[0], spacingOf(snapshot.levels[0]));
+    this.normals = new Normals(renderer, width, height, this.uniforms, isSphere(info), this.levels[0], spacingOf(snapshot.levels[0]));
   }
 
   /** Have all programs compiled; meanwhile nothing is drawn. */
   async compile(camera: PerspectiveCamera): Promise<void> {
+    this.meshOf(STRIDES.length - 1); // one will do: all are drawn by the same program
     await Promise.all([compile(this.renderer, this.object, camera), this.normals.compile()]);
   }
 
@@ -131,8 +128,10 @@ export class Surface {
     this.normals.drawDue();
     const batches = this.tiles.batches(camera);
     const triangles = batches.reduce((sum, { corners }, index) => sum + corners.length * (this.tileSide / STRIDES[index]!) ** 2, 0);
-    this.meshes.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.corners, batches[index]!.edges));
-    this.fans.forEach((mesh, index) => fill(mesh.geometry, batches[index]!.fans, []));
+    batches.forEach(({ corners, edges, fans }, index) => {
+      if (corners.length || this.meshes[index]) fill(this.meshOf(index).geometry, corners, edges);
+      if (fans.length || this.fans[index]) fill(this.fanOf(index).geometry, fans, []);
+    });
     (this.uniforms['uKey']!.value as Vector3).set(-0.45, 0.55, 0.8).normalize().transformDirection(camera.matrixWorld);
     (this.uniforms['uFill']!.value as Vector3).set(0.8, 0.05, 0.45).normalize().transformDirection(camera.matrixWorld);
     return triangles;
@@ -161,10 +160,25 @@ export class Surface {
   dispose(): void {
     for (const texture of [this.range, ...this.levels, this.coarse, this.dense]) texture.dispose();
     this.normals.dispose();
-    for (const { geometry, material } of [...this.meshes, ...this.fans]) {
-      geometry.dispose();
-      material.dispose();
+    for (const mesh of [...this.meshes, ...this.fans]) {
+      mesh?.geometry.dispose();
+      mesh?.material.dispose();
     }
+  }
+
+  private meshOf(index: number): GridMesh {
+    const stride = STRIDES[index]!;
+    return (this.meshes[index] ??= this.added(gridMesh(tileGrid(this.tileSide / stride), stride, this.tiles.count, this.uniforms, isSphere(this.info))));
+  }
+
+  private fanOf(index: number): GridMesh {
+    const stride = STRIDES[index]!;
+    return (this.fans[index] ??= this.added(gridMesh(fan(this.tileSide / stride), stride, 2 * this.tiles.across, this.uniforms, true, true)));
+  }
+
+  private added(mesh: GridMesh): GridMesh {
+    this.object.add(mesh);
+    return mesh;
   }
 
   private patchRange(changed: Changed[], level: Uint8Array): void {
