@@ -23,9 +23,9 @@ from node.audit_routes import SCAN
 from node.auth import require
 from node.exhibits import Exhibits
 from node.library import About, Scan
+from node.library_routes import explained
 from node.spool import CHUNK_BYTES, STALL_S, disk_trouble, send, spool
 from protocol import messages as m
-from protocol.errors import LibraryError
 
 IMPORT_BYTES_MAX = 1 << 29
 ARRAY_BYTES_MAX = 1 << 28
@@ -76,11 +76,9 @@ class ExchangeRoutes:
         return web.Response(body=body, content_type="application/json", status=status)
 
     async def _keep(self, found: Scanned) -> Scan:
-        about = About(time.time(), "import", found.name, note=found.note)
-        try:
+        with explained():
+            about = About(time.time(), "import", found.name, note=found.note)
             return await asyncio.to_thread(self._exhibits.library.add, found.grid, about)
-        except LibraryError as problem:
-            raise web.HTTPInsufficientStorage(text=str(problem)) from problem
 
 
 def _check_free(places: asyncio.Semaphore) -> None:

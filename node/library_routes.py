@@ -66,13 +66,13 @@ class LibraryRoutes:
 
     async def _sidecar(self, request: web.Request) -> web.Response:
         scan_id = self._known(request)
-        with _explained():
+        with explained():
             return _said(await asyncio.to_thread(self._library.sidecar, scan_id))
 
     async def _annotate(self, request: web.Request) -> web.Response:
         require(request, "operate")
         scan_id, revision = self._named(request), _revision(request)
-        with _explained():
+        with explained():
             changes = decode_changes(await request.read())
             request[WHAT] = ", ".join(changed_fields(changes))
             by = f"{request[LOGIN].name} at {request.remote}"[:BY_MAX]
@@ -87,7 +87,7 @@ class LibraryRoutes:
     async def _delete(self, request: web.Request) -> web.Response:
         require(request, "operate")
         scan_id = self._named(request)
-        with _explained():
+        with explained():
             await asyncio.to_thread(self._library.delete, scan_id)
         self._deleted(scan_id)
         return web.Response(status=204)
@@ -124,14 +124,14 @@ class LibraryRoutes:
     async def _delete_sweep(self, request: web.Request) -> web.Response:
         require(request, "operate")
         sweep = self._interrupted(request)
-        with _explained():
+        with explained():
             await asyncio.to_thread(self._library.sweeps.delete, sweep.id)
         return web.Response(status=204)
 
     async def _export_sweep(self, request: web.Request) -> web.StreamResponse:
         sweep = self._interrupted(request)
         with spool(self._library.folder) as file:
-            with _explained():
+            with explained():
                 await asyncio.to_thread(self._write, sweep, file)
             return await send(request, file, f"interrupted-{sweep.id}.npz", "application/octet-stream")
 
@@ -148,7 +148,7 @@ class LibraryRoutes:
 
 
 @contextmanager
-def _explained() -> Iterator[None]:
+def explained() -> Iterator[None]:
     """What a library cannot do, in the terms of HTTP."""
     try:
         yield

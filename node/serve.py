@@ -22,6 +22,7 @@ from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection, House
 from node.derive import Derivation
+from node.durable import NoRoom
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
@@ -362,6 +363,8 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
     """Errors as one JSON object: what is wrong, and where it can be known, the cure. A bug is a line in the log."""
     try:
         return await handler(request)
+    except NoRoom as error:
+        return _refusal(507, "insufficient storage", str(error))
     except LibraryError as error:
         return _refusal(404, "not found", str(error))
     except AccessError as error:

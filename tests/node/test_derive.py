@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from exchange.closing import close_scan, closes
 from exchange.native import NOTE_MAX, read_native
 from node import derive
+from node.durable import NoRoom
 from node.library import About, Library, content_id
 from node.serve import NodeServer
 from protocol.grid import Grid
@@ -62,6 +64,14 @@ async def test_what_has_a_long_note_can_be_derived_and_the_newest_of_it_is_kept(
         can = library.add(CAN, About(1e9, note="x" * NOTE_MAX)).id
         said = await derived(client, can, geometry="sphere", caps=True)
         assert len(said["note"]) == NOTE_MAX and said["note"].startswith("... xx") and "made up" in said["note"]
+
+
+async def test_a_full_disk_is_no_unknown_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with node(tmp_path, BALL) as (client, _, library, [ball]):
+        monkeypatch.setattr(library, "add", Mock(side_effect=NoRoom("the disk is full")))
+        answer = await client.post(f"/v1/scans/{ball}/derive", json={"geometry": "sphere"})
+        assert (answer.status, (await answer.json())["message"]) == (507, "the disk is full")
+        assert (await client.post(f"/v1/scans/{'0' * 32}/derive", json={"geometry": "sphere"})).status == 404
 
 
 async def test_what_is_made_up_is_said_and_stays_said(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from aiohttp.typedefs import Handler
 from exchange.native import read_native, write_native
 from node import exchange_routes
 from node.auth import LOGIN, Login, Role
+from node.durable import NoRoom
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.library import About, Library, content_id
@@ -225,10 +227,7 @@ async def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, monkeypat
         monkeypatch.setattr(exchange_routes, "writer_of", lambda suffix: full)
         answer = await client.get("/v1/scans/latest.glb")
         assert answer.status == 507 and await answer.text() == "the node's disk is full"
-        monkeypatch.setattr(exhibits.library, "add", _cannot_keep)
-        answer = await client.post("/v1/scans", data=native(vase()))
-        assert answer.status == 507 and "cannot keep" in await answer.text()
-
-
-def _cannot_keep(grid: Grid, about: About) -> None:
-    raise LibraryError("cannot keep scan x: No space left on device")
+        for trouble, status in ((NoRoom("cannot keep scan x: full"), 507), (LibraryError("cannot keep scan x"), 500)):
+            monkeypatch.setattr(exhibits.library, "add", Mock(side_effect=trouble))
+            answer = await client.post("/v1/scans", data=native(vase()))
+            assert answer.status == status and "cannot keep" in await answer.text()
