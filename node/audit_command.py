@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import getpass
+import os
 import sys
 from collections.abc import Sequence
 from itertools import islice
@@ -50,8 +50,9 @@ def note_at_console(config: Config, event: Event, scans: Sequence[str] = ("",), 
     import msgspec
 
     from node.audit import Who, done_trail, entry
+    from node.machine import user_name
 
-    who = Who(getpass.getuser(), "console")
+    who = Who(user_name(os.getuid()), "console")  # whoever it is: $USER is what somebody says
     lines = [msgspec.json.encode(entry(event, who, scan=scan, what=what)) for scan in scans]
     try:
         done_trail(config.library.path, config.audit.bytes_max).append(lines)

@@ -7,8 +7,8 @@ has the library to itself then, and its HTTP interface is the way.
 from __future__ import annotations
 
 import argparse
-import getpass
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from node.audit_command import note_at_console
+from node.machine import user_name
 from protocol.errors import LibraryError
 from protocol.printable import counted, printable
 
@@ -102,7 +103,7 @@ def run_rename(args: argparse.Namespace) -> int:
     scan_id = _resolve(folder, args.scan)
     with _opened(folder) as library:
         try:
-            library.rename(scan_id, args.name, getpass.getuser())
+            library.rename(scan_id, args.name, user_name(os.getuid()))
         except ValueError as problem:
             raise LibraryError(f"name: {problem}") from problem
     note_at_console(_config(args), "changed", (scan_id,), "name")

@@ -1,13 +1,16 @@
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from node.audit import done_trail, read_trail
 from node.library import About, Library
 from node.library_command import add_library_command
+from node.machine import user_name
 from node.sidecar import Changes
 from protocol.errors import LibraryError
 from protocol.grid import Grid, GridSpec
@@ -100,6 +103,20 @@ def test_rename_names_the_scan(folder: Path, capsys: pytest.CaptureFixture[str])
     for name in ("x" * 201, "", " "):
         with pytest.raises(LibraryError, match="^name: "):
             run("rename", "latest", name, "--library", folder)
+
+
+@pytest.mark.parametrize("user_id", [os.getuid(), 987654321])
+def test_who_did_it_is_the_account_whatever_the_environment_says(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, user_id: int
+) -> None:
+    for name in ("LOGNAME", "USER"):
+        monkeypatch.setenv(name, "the doctor")
+    monkeypatch.setattr(os, "getuid", lambda: user_id)
+    run("rename", "latest", "elbow", "--library", folder)
+    capsys.readouterr()
+    run("show", "latest", "--library", folder, "--json")
+    [noted] = read_trail(done_trail(folder, 1 << 20))
+    assert noted.by == said(capsys)["sidecar"]["history"][-1]["by"] == user_name(user_id)
 
 
 def test_list_and_rename_tell_ids_that_every_other_command_takes(
