@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 from weakref import WeakSet
@@ -27,6 +27,7 @@ from protocol.live import LiveColumns
 from protocol.refinement import Generator, Refinement
 from protocol.session import Said
 
+READ_OUT_S = 5.0  # of a line that is closed already; all that came is there
 log = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer", Model, Update, m.Enveloped)
@@ -118,6 +119,10 @@ class Reader:
             news.end(self.ended)
         return news
 
+    async def read_out(self) -> None:
+        """Wait until all is read that a node said before it went, the reason among it."""
+        await asyncio.wait({self._task}, timeout=READ_OUT_S)
+
     async def close(self) -> None:
         """Read no more; whoever still waits gets NodeLost."""
         self._task.cancel()
@@ -179,7 +184,7 @@ class Reader:
     async def _first_view(self, replica: Replica) -> None:
         if (waiting := self._opening.pop(replica.request, None)) is not None:
             _settle(waiting, replica.model)
-        await self._stream.send(replica.acknowledge())
+        await self._say(replica.acknowledge())
 
     def _bind(self, opened: m.Opened) -> None:
         self._check_asked(opened.request)
@@ -199,12 +204,12 @@ class Reader:
         if lost:
             await self._state(replica.object())
         elif not superseded:
-            await self._stream.send(replica.acknowledge())
+            await self._say(replica.acknowledge())
 
     async def _state(self, state: m.State | None) -> None:
         if state is not None:
             self._resyncs += 1
-            await self._stream.send(state)
+            await self._say(state)
 
     def _close(self, updated: m.Updated, lost: int = 0) -> None:
         """Answer a look."""
@@ -217,6 +222,11 @@ class Reader:
                 _settle(answer, error)
                 return
         log.warning("%s, about request %d, which nobody waits for", error, refused.request)
+
+    async def _say(self, message: m.FromClient) -> None:
+        """Say something, if the node still listens; why it does not is read next."""
+        with suppress(NodeLost):
+            await self._stream.send(message)
 
     def _end(self, cause: Exception, on_purpose: bool = False) -> None:
         if self.ended is not None:

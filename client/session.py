@@ -277,7 +277,11 @@ class Session:
     async def _send(self, message: m.FromClient) -> None:
         if (cause := self._reader.ended) is not None:
             raise cause
-        await self._stream.send(message)
+        try:
+            await self._stream.send(message)
+        except NodeLost as lost:
+            await self._reader.read_out()
+            raise self._reader.ended or lost from None
 
     def _opened_model(self) -> Model:
         if self.model is None:

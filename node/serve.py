@@ -146,7 +146,10 @@ class NodeServer:
             await asyncio.wait(goodbyes, timeout=GOODBYE_S)
         await self._gate.close()
         for line in self._connections.values():
-            line.abort()
+            if line.get_write_buffer_size():
+                line.abort()  # it does not read
+            else:
+                line.close()  # a slow one reads on: all that was said is on its way
         await self.derivation.stop()
         self.audit.note("stopped", NODE)
         await self._runner.cleanup()

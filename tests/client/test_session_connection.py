@@ -117,6 +117,25 @@ async def test_news_that_nobody_reads_is_not_kept_for_ever() -> None:
             await anext(sleeper)
 
 
+async def test_who_speaks_to_a_node_that_has_just_gone_hears_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = asyncio.Event()
+
+    async def script(line: Line) -> None:
+        await greet(line)
+        await said.wait()
+        await line.say(m.Goodbye("the node is stopping"))
+        await until_gone(line)
+
+    async def refused(stream: client_stream.Stream, message: m.FromClient) -> None:
+        said.set()
+        raise NodeLost("cannot write to closing transport")
+
+    async with session_with(script) as session:
+        monkeypatch.setattr(client_stream.Stream, "send", refused)
+        with pytest.raises(NodeLost, match="the node is stopping"):
+            await anext(session.live())
+
+
 async def test_a_client_may_connect_to_what_discovery_found() -> None:
     async with serving(show_and_answer) as url:
         host, port = url.removeprefix("http://").split(":")
