@@ -82,9 +82,15 @@ class Gate:
         self.lines: set[Line] = set()
         self.turned_away = 0  # connections that were closed without a word
 
+    def use(self, limits: Limits) -> None:
+        """Go on with other limits. What stands stays: nobody is hung up on for being one too many."""
+        if limits.requests_s_per_address != self._limits.requests_s_per_address:
+            self._rates = Buckets(limits.requests_s_per_address)
+        self._limits, self._most = limits, _most_connections(limits)
+
     async def open(self, runner: web.AppRunner, host: str, port: int, tls: ssl.SSLContext | None) -> tuple[str, int]:
         """Begin to listen. Returns the address bound. Raises OSError when it cannot be."""
-        self._most = min(self._limits.connections, _descriptors(self._limits.connections + FILES_BESIDE) - FILES_BESIDE)
+        self._most = _most_connections(self._limits)
         found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
         try:
             for family, (address, _, *more) in dict.fromkeys((family, where) for family, _, _, _, where in found):
@@ -234,6 +240,11 @@ class Gate:
     def _spawn(self, work: Any) -> None:
         self._tasks.add(task := asyncio.create_task(work))
         task.add_done_callback(self._tasks.discard)
+
+
+def _most_connections(limits: Limits) -> int:
+    """As many as are wanted, or as this process may have files for."""
+    return min(limits.connections, _descriptors(limits.connections + FILES_BESIDE) - FILES_BESIDE)
 
 
 def _after(wait_s: float) -> dict[str, str]:

@@ -7,14 +7,15 @@ from typing import Any
 
 import msgspec
 
-from node.config import Config
+from node.config import Config, Limits
 
 LIVE = frozenset({
     "capture.passes", "capture.overlap", "capture.stride", "capture.apart", "capture.repair",
     "server.certificate", "server.key", "server.max_clients",
     "planner.cold_start_bytes_s",
     "retention.max_age_days", "retention.max_gb",
-    "log.level", "log.format",
+    "log.level", "log.format", "library.spheres",
+    *(f"limits.{key}" for key in Limits.__struct_fields__),
 })  # fmt: skip
 
 

@@ -221,6 +221,7 @@ class NodeServer:
         """Go on with other settings, of those that `node.reload` lets change. Raises AccessError, and changes none."""
         if self._tls is not None:
             self._tls.use(config.server)
+        self._gate.use(config.limits)
         self._config = config
 
     def publish(self, news: m.Published) -> None:

@@ -14,9 +14,9 @@ import pytest
 
 from client import connect
 from node import gate
-from node.config import Limits, Server
+from node.config import Config, Limits, Server
 from protocol.messages import PROTOCOL
-from tests.node.entrance import Entrance, entrance
+from tests.node.entrance import ANY_PORT, Entrance, entrance
 from tests.waiting import until
 
 
@@ -57,6 +57,25 @@ async def end_of(reader: asyncio.StreamReader) -> bytes:
         async with asyncio.timeout(15):
             return await reader.read()
     return b""
+
+
+async def test_other_limits_hold_at_once(tmp_path: Path) -> None:
+    async with entrance(tmp_path, limits=Limits(requests_s_per_address=1)) as node:
+
+        async def statuses() -> set[int]:
+            said = set()
+            for _ in range(40):
+                async with node.ask("GET", "/healthz") as answer:
+                    said.add(answer.status)
+            return said
+
+        assert 429 in await statuses()
+        node.server.use(Config(server=ANY_PORT))
+        assert await statuses() == {200}
+        node.server.use(Config(server=ANY_PORT, limits=Limits(connections_per_address=1)))
+        async with line_to(node) as surplus:  # beside the one that has asked so far, and stays
+            assert b"too many connections" in await answer_on(surplus)
+        assert await statuses() == {200}
 
 
 @pytest.mark.parametrize("said", [b"", b"GET /healthz HT", b"GET /healthz HTTP/1.1\r\nHost: x\r\nA: b"])
