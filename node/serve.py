@@ -50,6 +50,7 @@ WRITE_LIMIT_BYTES = 16 * 1024
 HEARTBEAT_S = 20.0
 BODY_MAX_BYTES = 1 << 16
 GOODBYE_S = 1.0
+SLOW_S = 2.0  # more for those who read, and have not answered yet
 ACCESS_S = 0.5  # between looks at what other processes changed of tokens and certificate
 RETAIN_S = 600.0  # between looks at what was kept long enough
 RENEW_S = 3600.0  # between looks at the certificate
@@ -140,19 +141,26 @@ class NodeServer:
         self._is_stopping = True
         for task in self._watching:
             task.cancel()
-        why = "the node is stopping", WSCloseCode.GOING_AWAY
-        goodbyes = [asyncio.ensure_future(connection.close(*why)) for connection in self._connections]
-        if goodbyes:
-            await asyncio.wait(goodbyes, timeout=GOODBYE_S)
+        await self._say_goodbye()
         await self._gate.close()
         for line in self._connections.values():
-            if line.get_write_buffer_size():
-                line.abort()  # it does not read
-            else:
-                line.close()  # a slow one reads on: all that was said is on its way
+            line.abort()
         await self.derivation.stop()
         self.audit.note("stopped", NODE)
         await self._runner.cleanup()
+
+    async def _say_goodbye(self) -> None:
+        """Have every stream read why it ends: who reads slowly is waited for, who does not read is hung up on."""
+        why = "the node is stopping", WSCloseCode.GOING_AWAY
+        goodbyes = [asyncio.ensure_future(connection.close(*why)) for connection in self._connections]
+        if not goodbyes:
+            return
+        _, slow = await asyncio.wait(goodbyes, timeout=GOODBYE_S)
+        for line in self._connections.values():
+            if line.get_write_buffer_size():
+                line.abort()
+        if slow:
+            await asyncio.wait(slow, timeout=SLOW_S)
 
     async def _watch_access(self) -> None:
         """Notice what commands beside this process revoke, and certificates that were renewed or are due."""

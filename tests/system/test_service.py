@@ -150,14 +150,14 @@ async def test_sigterm_in_the_middle_of_a_sweep_tells_clients_and_keeps_its_colu
         await ready_to_sweep(ready["url"])
         async with connect(ready["url"]) as session:
             await session.start_sweep()
-            is_told = False
+            news, is_told = session.published(), False
             async for frame in session.live():
                 if frame.percent > 10 and not is_told:
                     is_told = True
                     node.terminate()
             assert frame.ended == "interrupted"
             with pytest.raises(NodeLost, match="the node is stopping"):
-                await anext(session.live())
+                await anext(news)
             assert await asyncio.to_thread(node.wait, STOP_S) == 0
     library = Library(tmp_path / "library")
     (kept,) = library.sweeps.interrupted()
