@@ -19,7 +19,6 @@ from typing import Literal
 import numpy as np
 
 from drivers.scanner import SweepEvent, SweepInterrupted, SweepProgress, SweepStarted
-from node.assemble import Encoder
 from node.coarse import (
     BYTES_PER_RANGE_CELL,
     BYTES_PER_TEXEL,
@@ -28,6 +27,7 @@ from node.coarse import (
     TEXTURE_SPACING_MIN,
     coarse_shape,
 )
+from node.resampling import Encoder
 from protocol import messages as m
 from protocol.grid import GridSpec, ImageArray, IntArray, StepArray
 from protocol.lattice import Channel

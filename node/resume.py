@@ -13,8 +13,9 @@ from dataclasses import replace
 
 from drivers.ledger import Ledger
 from drivers.scanner import Scanner, SweepEvent, SweepFinished, SweepInterrupted, SweepReport, SweepStarted
-from node.assemble import Assembler, Assembly, Encoder
+from node.assemble import Assembler, Assembly
 from node.journal import Interrupted, Journals
+from node.resampling import Encoder
 from node.turns import STOPPED, TurnEvents, gone_on
 from protocol.errors import FoveascanError, ScannerFault
 from protocol.scanner_messages import (

@@ -154,7 +154,8 @@ def read(address: str, size_bytes: str) -> None:
 def assemble() -> None:
     """A sweep at L whose last column has just come; memory is what it took beyond the program itself."""
     from exchange.formats import SIZES
-    from node.assemble import Assembler, Encoder
+    from node.assemble import Assembler
+    from node.resampling import Encoder
     from protocol.grid import GridSpec
 
     width, height, texture_width, texture_height = SIZES["L"]

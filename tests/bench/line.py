@@ -17,12 +17,13 @@ import numpy as np
 
 from client.model import Model
 from exchange.formats import SIZES
-from node.assemble import Assembler, Encoder
+from node.assemble import Assembler
 from node.coarse import build_coarse, build_pyramid, fill_voids
 from node.first_view import FirstView, build_first_view
 from node.foveate import Update, plan_update
 from node.library import Scan
 from node.refine_texture import texture_lattice
+from node.resampling import Encoder
 from node.sample import texture_samples
 from node.texture_model import TextureModel
 from protocol.codec import JPEG_QUALITY_MIN, jpeg_q

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from node.assemble import Assembler, Assembly, Encoder, IncompleteTurn
+from node.assemble import Assembler, Assembly, IncompleteTurn
+from node.resampling import Encoder
 from protocol.errors import RemoteWireError
 from protocol.grid import FloatArray, Grid, GridSpec, ImageArray, StepArray
 

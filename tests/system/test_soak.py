@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from protocol.grid import GridSpec
 from protocol.scanner_messages import Order, SweepRequest
+from simulators.scanner import ANY_CHANNELS, APART
 from tests.system.fault_rig import Bench, Capturing, Ending, bumpy, memory
 
 S = GridSpec(360, 100, 1024, 256, 0.01, 2.0)
@@ -36,7 +38,8 @@ def draw(seed: int, folder: Path) -> tuple[Bench, SweepRequest]:
         ",".join([*shares, *once, *flaws]), seed, folder, specimen=SPECIMEN, order=order, retention_columns=retention
     )
     overlap = 16 if flaws else int(rng.choice([0, 16]))  # nothing tells of a slip but seeing the same twice
-    return bench, SweepRequest(overlap=overlap, stride=int(rng.choice([1, 1, 8])))
+    request = SweepRequest(overlap=overlap, stride=int(rng.choice([1, 1, 8])))
+    return replace(bench, channels=APART if rng.random() < 0.2 else ANY_CHANNELS), request
 
 
 def verdict(bench: Bench, ending: Ending) -> str:
@@ -78,5 +81,6 @@ def _soak(seed: int, folder: Path) -> str:
         with memory(bench) as line:
             return verdict(bench, Capturing(line, bench.folder, request).run())
     except Exception as problem:
-        problem.add_note(f"seed {seed}: simulate --faults {bench.faults}, {bench.order.name}, {request}")
+        how = f"{bench.order.name}, {bench.channels}, {request}"
+        problem.add_note(f"seed {seed}: simulate --faults {bench.faults}, {how}")
         raise
