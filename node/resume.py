@@ -16,7 +16,7 @@ from drivers.scanner import Scanner, SweepEvent, SweepFinished, SweepInterrupted
 from node.assemble import Assembler, Assembly
 from node.journal import Interrupted, Journals
 from node.resampling import Encoder
-from node.turns import STOPPED, TurnEvents, gone_on
+from node.turns import STOPPED, TurnEvents, TurnStarted, as_of_sweep, gone_on
 from protocol.errors import FoveascanError, ScannerFault
 from protocol.scanner_messages import (
     Column,
@@ -146,7 +146,7 @@ def _swept_again(
                     yield _refusal("the scanner sweeps otherwise than before")
                     return
             elif isinstance(event, RangeColumn | TextureColumn):
-                column = _column_as_of(event, again, header)
+                column = as_of_sweep(event, TurnStarted(again, 0), header)
                 if ledger.take(column):
                     yield column
                 if ledger.held == ledger.expected:
@@ -163,8 +163,3 @@ def _refusal(reason: str) -> SweepInterrupted:
 def _as_of(again: SweepHeader, header: SweepHeader) -> SweepHeader:
     """The new sweep's header with all that may differ taken from the old one."""
     return replace(again, sweep=header.sweep, encoder_start=header.encoder_start)
-
-
-def _column_as_of(column: Column, again: SweepHeader, header: SweepHeader) -> Column:
-    """A column of the new sweep as the old one would have named it: the encoder counts from another home."""
-    return replace(column, sweep=header.sweep, encoder=column.encoder - again.encoder_start + header.encoder_start)

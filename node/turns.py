@@ -65,7 +65,7 @@ def swept(scanner: Scanner, request: SweepRequest, stop: threading.Event, *, apa
     events = scanner.sweep(_turn_request(request, Channel.RANGE, 0), stop)
     first = _header_of(events)
     with closing(events):
-        whole = _Whole(scanner, stop, _planned(first, request))
+        whole = _Whole(scanner, stop, replace(first, channels=Channel.BOTH, passes=request.passes))
         yield SweepStarted(whole.header)
         cut = yield from whole.turn(first, events, Channel.RANGE, 0)
     if cut is not None:
@@ -102,16 +102,8 @@ def gone_on(
     yield from whole.rest(SweepRequest(header.channels, header.passes, *shape, overlap=header.overlap))
 
 
-def _planned(first: SweepHeader, request: SweepRequest) -> SweepHeader:
-    """The header of the whole sweep, by that of its first turn. Raises ScannerFault where nobody can count so far."""
-    counts = abs(first.encoder_start) + first.counts_per_turn * LAPS_APART * request.passes
-    if request.passes > 1 and counts >= COUNT_LIMIT:
-        raise ScannerFault(f"{first.counts_per_turn} counts a turn are too many for {request.passes} passes apart")
-    return replace(first, channels=Channel.BOTH, passes=request.passes)
-
-
 def as_of_sweep(column: Column, turn: TurnStarted, header: SweepHeader) -> Column:
-    """A column of one turn as the whole sweep names and counts it."""
+    """A column of one turn as the whole sweep names and counts it. Raises ScannerFault where counts end."""
     return _moved(column, turn.header, header, turn.pass_index)
 
 
@@ -123,6 +115,8 @@ def as_of_turn(column: Column, turn: TurnStarted, header: SweepHeader) -> Column
 def _moved(column: Column, before: SweepHeader, after: SweepHeader, passes: int) -> Column:
     laps = passes * LAPS_APART * before.counts_per_turn
     encoder = after.encoder_start + column.encoder - before.encoder_start + before.direction * laps
+    if not -COUNT_LIMIT <= encoder < COUNT_LIMIT:
+        raise ScannerFault(f"column {column.column} stands at count {encoder}, further than an encoder counts")
     return replace(column, sweep=after.sweep, pass_index=column.pass_index + passes, encoder=encoder)
 
 

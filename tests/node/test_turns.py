@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from drivers.scanner import SweepEvent, SweepFinished, SweepInterrupted, SweepPr
 from node.capture import Manner
 from node.journal import Journals
 from node.resume import publish_complete
-from protocol.errors import LibraryError
+from node.turns import TurnStarted, as_of_sweep, as_of_turn
+from protocol.errors import LibraryError, ScannerFault
 from protocol.grid import Grid
-from protocol.scanner_messages import Channel, RangeColumn, SweepRequest, TextureColumn
+from protocol.scanner_messages import Channel, RangeColumn, SweepHeader, SweepRequest, TextureColumn
 from simulators.scanner import APART, TOGETHER, SimulatedScanner
 from tests.node.capturing import SPEC, WAIT_S, Node, Plug, device, is_truth
 
@@ -154,6 +156,16 @@ def test_a_complete_one_whose_grid_was_not_taken_is_published_later(plug: Plug, 
     node.deliver = node.grids.put
     assert publish_complete(sweeps, node.take)[0].startswith("published sweep")
     assert is_truth(node.grids.get(timeout=WAIT_S))
+
+
+def test_a_column_beyond_what_an_encoder_counts_is_the_scanner_s_fault() -> None:
+    whole = SweepHeader(1, SPEC, 65536, 100, 100, encoder_start=2**31 - 70000)
+    turn = TurnStarted(SweepHeader(2, SPEC, 65536, 100, 100, channels=Channel.RANGE), 1)
+    column = RangeColumn(2, 0, 3, 0, 500, 0, b"xx")
+    near = replace(turn, header=replace(turn.header, encoder_start=2**18))
+    assert as_of_turn(as_of_sweep(column, near, whole), near, whole) == column
+    with pytest.raises(ScannerFault, match="further than an encoder counts"):
+        as_of_sweep(column, turn, whole)
 
 
 def cut(plug: Plug, node: Node, share: float, scanner: SimulatedScanner) -> str:
