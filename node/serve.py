@@ -157,7 +157,7 @@ class NodeServer:
             return
         _, slow = await asyncio.wait(goodbyes, timeout=GOODBYE_S)
         for line in self._connections.values():
-            if line.get_write_buffer_size():
+            if not line.is_closing() and line.get_write_buffer_size():
                 line.abort()
         if slow:
             await asyncio.wait(slow, timeout=SLOW_S)
