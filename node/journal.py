@@ -18,7 +18,6 @@ import mmap
 import os
 import re
 import secrets
-import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -27,10 +26,21 @@ from pathlib import Path
 from drivers.ledger import Ledger
 from node.background_writer import BackgroundWriter
 from node.durable import NEW, disk_error, require_room, sync_folder, write_whole
+from node.journal_records import (
+    ENTRY_OVERHEAD,
+    RECORD_OVERHEAD,
+    column_parts,
+    columns_in,
+    decode_opening,
+    encode_entry,
+    encode_opening,
+    encode_record,
+    messages_in,
+    read_records,
+)
 from node.scan_folder import Problem
 from node.turns import TurnStarted
-from protocol.checksum import crc32
-from protocol.errors import LibraryError, RemoteWireError
+from protocol.errors import LibraryError
 from protocol.scanner_messages import (
     COLUMN_OVERHEAD,
     Channel,
@@ -44,23 +54,14 @@ from protocol.scanner_messages import (
     SweepEnd,
     SweepHeader,
     TextureColumn,
-    decode_message,
-    is_known,
 )
 
-FORMAT = 1
 SUFFIX = ".sweep"
 RECORD_BYTES = 65536  # a record is written once its messages reach this
-PAYLOAD_BYTES_MAX = 2 * 65536
 SPARE_BYTES = 16 << 20  # what a sweep must leave free: sidecars, logs, other programs
 CUT_SHORT = "the node was cut off in the middle of it"
 COMPLETE = "it is complete, and was not published yet"
 
-_MAGIC = b"FSj\x01"
-_RECORD = struct.Struct("<4sII")  # magic, length of the payload, CRC-32 of the payload begun at its length
-_MESSAGE = struct.Struct("<BH")  # type, length
-_BEGIN_TYPE = 0x00  # no message of the link
-_BEGIN = struct.Struct("<Hd")  # format, start by the node's clock
 _COLUMNS = (RangeColumn, TextureColumn)
 _ID = re.compile("[0-9a-f]{16}")
 
@@ -145,13 +146,9 @@ class Journal:
             raise failure
 
     def _take(self, message: Message) -> None:
-        if isinstance(message, _COLUMNS):  # thousands a second: their samples are copied once, into the record
-            size = COLUMN_OVERHEAD + len(message.data)
-            self._messages += (_MESSAGE.pack(message.TYPE, size) + message.name_bytes(), message.data)
-            self._size += _MESSAGE.size + size
-        else:
-            self._messages.append(encode_entry(message))
-            self._size += len(self._messages[-1])
+        parts = column_parts(message) if isinstance(message, _COLUMNS) else (encode_entry(message),)
+        self._messages += parts
+        self._size += sum(map(len, parts))
 
 
 class Journals:
@@ -226,7 +223,7 @@ class Journals:
         """The columns of an interrupted sweep, each piece once; their samples lie in the file. Raises LibraryError."""
         ledger = Ledger(self.get(sweep_id).header)
         for _, payload in read_records(_map(self._path(sweep_id))):
-            yield from (column for column in _columns_in(payload) if ledger.take(column))
+            yield from (column for column in columns_in(payload) if ledger.take(column))
 
     def delete(self, sweep_id: str) -> None:
         """Delete an interrupted sweep. Raises LibraryError when there is none such."""
@@ -296,55 +293,24 @@ def needed_bytes(header: SweepHeader) -> int:
     for channel, sample_bytes in ((Channel.RANGE, 2), (Channel.TEXTURE, 3)):
         if channel in header.channels:
             _, rows, piece_rows = header.shape(channel)
-            column_bytes = rows * sample_bytes + -(-rows // piece_rows) * (_MESSAGE.size + COLUMN_OVERHEAD)
+            column_bytes = rows * sample_bytes + -(-rows // piece_rows) * (ENTRY_OVERHEAD + COLUMN_OVERHEAD)
             total += sum(header.columns_in(channel)) * column_bytes
     return total
-
-
-def encode_opening(info: DeviceInfo, header: SweepHeader, started_unix_s: float) -> bytes:
-    """The first record of a journal."""
-    begin = _BEGIN.pack(FORMAT, started_unix_s)
-    return encode_record(
-        _MESSAGE.pack(_BEGIN_TYPE, len(begin)) + begin + encode_entry(info) + encode_entry(header)
-    )
-
-
-def encode_entry(message: Message) -> bytes:
-    """A message of the link as it stands in a record."""
-    data = message.to_bytes()
-    return _MESSAGE.pack(message.TYPE, len(data)) + data
-
-
-def encode_record(payload: bytes) -> bytes:
-    """A record; read_records is the inverse."""
-    return b"".join((_RECORD.pack(_MAGIC, len(payload), _checksum(payload)), payload))
-
-
-def read_records(data: bytes | mmap.mmap) -> Iterator[tuple[int, memoryview]]:
-    """(place behind it, payload) of every whole record; what lies between them is passed over."""
-    at = 0
-    while at >= 0:
-        payload = _record_at(data, at)
-        if payload is None:
-            at = data.find(_MAGIC, at + 1)
-        else:
-            at += _RECORD.size + len(payload)
-            yield at, payload
 
 
 def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
     """What a journal holds, up to its last whole record. Raises LibraryError when it is none."""
     records = read_records(data)
     end, opening = next(records, (0, memoryview(b"")))
-    if end != _RECORD.size + len(opening) or not opening:
+    if end != RECORD_OVERHEAD + len(opening) or not opening:
         raise LibraryError("its beginning is damaged")
-    started_unix_s, info, header = _decode_opening(opening)
+    started_unix_s, info, header = decode_opening(opening)
     ledger, read_bytes, why = Ledger(header), end, CUT_SHORT
     counted: SweepEnd | None = None
     turn: TurnStarted | None = None
     for place, payload in records:
-        end, read_bytes = place, read_bytes + _RECORD.size + len(payload)
-        for message in _messages_in(payload):
+        end, read_bytes = place, read_bytes + RECORD_OVERHEAD + len(payload)
+        for message in messages_in(payload):
             if isinstance(message, Fault):
                 why = message.text
             elif isinstance(message, SweepEnd):
@@ -357,64 +323,6 @@ def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
     counts = ledger.held, ledger.expected, end, end - read_bytes
     said = COMPLETE if is_complete else why
     return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, said, is_complete, turn)
-
-
-def _record_at(data: bytes | mmap.mmap, at: int) -> memoryview | None:
-    """The payload of the record that begins here, if a whole one does."""
-    if len(data) - at < _RECORD.size:
-        return None
-    magic, size, checksum = _RECORD.unpack_from(data, at)
-    begin = at + _RECORD.size
-    if magic != _MAGIC or size > min(PAYLOAD_BYTES_MAX, len(data) - begin):
-        return None
-    payload = memoryview(data)[begin : begin + size]
-    return payload if _checksum(payload) == checksum else None
-
-
-def _checksum(payload: bytes | memoryview) -> int:
-    return crc32(payload, len(payload))
-
-
-def _entries(payload: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(type, bytes) of every message in a record. Raises LibraryError."""
-    at = 0
-    while at < len(payload):
-        begin = at + _MESSAGE.size
-        kind, size = _MESSAGE.unpack_from(payload, at) if begin <= len(payload) else (0, len(payload))
-        at = begin + size
-        if at > len(payload):
-            raise LibraryError("a record ends in the middle of a message")
-        yield kind, payload[begin:at]
-
-
-def _messages_in(payload: memoryview) -> Iterator[Message]:
-    """The messages of a record. Raises LibraryError."""
-    for kind, data in _entries(payload):
-        if not is_known(kind):
-            raise LibraryError(f"it holds a message of type {kind:#04x}, which this version does not know")
-        try:
-            yield decode_message(kind, data)
-        except RemoteWireError as error:
-            raise LibraryError(f"it holds a message that makes no sense: {error}") from error
-
-
-def _columns_in(payload: memoryview) -> Iterator[Column]:
-    """The columns of a record behind the first; that has none, and BEGIN, which is no message of the link."""
-    if payload[:1] != bytes([_BEGIN_TYPE]):
-        yield from (m for m in _messages_in(payload) if isinstance(m, RangeColumn | TextureColumn))
-
-
-def _decode_opening(payload: memoryview) -> tuple[float, DeviceInfo, SweepHeader]:
-    (kind, begin), *_ = _entries(payload)
-    if kind != _BEGIN_TYPE or len(begin) < _BEGIN.size:
-        raise LibraryError("its beginning is damaged")
-    format, started_unix_s = _BEGIN.unpack_from(begin)
-    if format != FORMAT:
-        raise LibraryError("written in a format that this version does not know")
-    match list(_messages_in(payload[_MESSAGE.size + len(begin) :])):
-        case [DeviceInfo() as info, SweepHeader() as header]:
-            return started_unix_s, info, header
-    raise LibraryError("its beginning is damaged")
 
 
 def _map(path: Path) -> bytes | mmap.mmap:

@@ -34,7 +34,8 @@ SERIAL_BYTES_S, USB_BYTES_S = 300_000, 35_000_000
 CLIENTS = 16
 WORKER = [sys.executable, "-m", "tests.bench.capture_worker"]
 ROOT = Path(__file__).parents[2]
-DRIVER_BYTES = 256_000_000
+DRIVER_BYTES, PACED_BYTES = 256_000_000, 64_000_000
+SWEEP_LASTS = 3  # repetitions of anything else: so many times less often is a sweep repeated
 AWAY_S = 0.6
 PASSES = 4  # of M over USB: long enough to be measured
 UNPACED = float("inf")
@@ -55,11 +56,12 @@ class Line:
 
 
 def run(repeats: int) -> dict[str, Any]:
-    """Everything. Raises ConfigError where USB cannot be emulated."""
+    """Everything, each a third as often as `repeats` says. Raises ConfigError where USB cannot be emulated."""
     from simulators.usb_testbed import PRELOAD, is_available
 
     if not is_available():
         raise ConfigError(f"bench: no {PRELOAD} here: apt-get install umockdev libusb-1.0-0")
+    repeats = max(1, repeats // SWEEP_LASTS)
     return {
         "repeats": repeats,
         "clients": CLIENTS,
@@ -67,7 +69,7 @@ def run(repeats: int) -> dict[str, Any]:
         "usb": sweeps("usb", "M", USB_BYTES_S, PASSES, repeats),
         "unpaced": unpaced(repeats),
         "driver": {str(portion): driver(portion, repeats) for portion in (1 << 16, 1 << 18)},
-        "driver_paced": driver(1 << 16, repeats, USB_BYTES_S),
+        "driver_paced": driver(1 << 16, repeats, USB_BYTES_S, PACED_BYTES),
         "recovery_s": recovery(repeats),
         "assembly": assembly(repeats),
     }
@@ -136,7 +138,9 @@ async def _sweep(running: Line, window_s: float) -> tuple[float, int]:
     return (last[1] - first[1]) / (last[0] - first[0]), quality.requested_columns
 
 
-def driver(portion_bytes: int, repeats: int, rate_bytes_s: float = UNPACED) -> dict[str, float]:
+def driver(
+    portion_bytes: int, repeats: int, rate_bytes_s: float = UNPACED, size_bytes: int = DRIVER_BYTES
+) -> dict[str, float]:
     """The USB driver alone on the real libusb: MB/s, and its share of a core, the emulation's work included."""
     from simulators.usb_testbed import UsbTestbed
 
@@ -145,19 +149,19 @@ def driver(portion_bytes: int, repeats: int, rate_bytes_s: float = UNPACED) -> d
     for _ in range(repeats):
         with tempfile.TemporaryDirectory(prefix="fs-") as folder, ExitStack() as stack:
             bed = stack.enter_context(closing(UsbTestbed(Path(folder), rate_bytes_s=rate_bytes_s)))
-            with worker("read", bed.name, str(DRIVER_BYTES), environment=bed.environment) as said:
+            with worker("read", bed.name, str(size_bytes), environment=bed.environment) as said:
                 bed.read(1 << 16, 30)
-                sending = threading.Thread(target=_flood, args=(bed, data))
+                sending = threading.Thread(target=_flood, args=(bed, data, size_bytes))
                 sending.start()
                 told = json.loads(said.readline())
                 sending.join()
-        rates.append(DRIVER_BYTES / MEGABYTE / told["seconds"])
+        rates.append(size_bytes / MEGABYTE / told["seconds"])
         shares.append(told["cpu_s"] / told["seconds"])
     return {"mb_s": median(rates), "core": median(shares)}
 
 
-def _flood(bed: Any, data: bytes) -> None:
-    for _ in range(DRIVER_BYTES // len(data) + 2):
+def _flood(bed: Any, data: bytes, size_bytes: int) -> None:
+    for _ in range(size_bytes // len(data) + 2):
         bed.write(data)
 
 

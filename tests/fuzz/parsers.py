@@ -23,7 +23,8 @@ from exchange.native import read_native
 from node.access import Access, access_folder
 from node.archive import backup, restore
 from node.config import load_config
-from node.journal import encode_entry, encode_opening, encode_record, survey_journal
+from node.journal import survey_journal
+from node.journal_records import encode_entry, encode_opening, encode_record
 from node.library import About, Library
 from node.sidecar import decode_changes
 from protocol import messages as m

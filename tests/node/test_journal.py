@@ -13,16 +13,8 @@ from hypothesis import strategies as st
 
 from node import durable
 from node.durable import NoRoom
-from node.journal import (
-    COMPLETE,
-    CUT_SHORT,
-    Journals,
-    encode_opening,
-    encode_record,
-    needed_bytes,
-    read_records,
-    survey_journal,
-)
+from node.journal import COMPLETE, CUT_SHORT, Journals, needed_bytes, survey_journal
+from node.journal_records import encode_opening, encode_record, read_records
 from protocol.errors import LibraryError
 from protocol.grid import GridSpec
 from protocol.scanner_messages import (
