@@ -54,7 +54,8 @@ class Bound:
             raise LatticeError(f"the scan is not open with the {look.profile} profile")
         if isinstance(self.state, ClassicState):
             return plan_classic(self.scan, self.state, look, budget_bytes, superseded)
-        codec = choose_codec(codecs, self.scan, look, model)
+        spares_time = hurried and quick and model is not None and "jpeg" in codecs  # and bytes are to be had
+        codec = choose_codec(("jpeg", *codecs) if spares_time else codecs, self.scan, look, model)
         plan = partial(
             plan_update, self.scan, self.state, look, budget_bytes=budget_bytes, superseded=superseded, model=model,
             quick=quick, range_model=range_model, hurried=hurried,

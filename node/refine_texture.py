@@ -184,6 +184,8 @@ def held_error(
     kept : which, (rows, columns) of Region.blocks.
     Blocks that were never measured count as the model expects them, or as just good enough without one.
     """
+    if not kept.any():
+        return 0.0, 0
     every_row, every_column = _place(state.missed.shape, region)
     rows, across = np.nonzero(kept)
     rows, across = every_row.ravel()[rows], every_column.ravel()[across]

@@ -64,6 +64,26 @@ def test_a_look_gets_what_it_asks_for_whatever_the_client_likes_best(
     assert update.texture_db is not None and update.texture_db >= texture_db
 
 
+@pytest.mark.parametrize(
+    ("quick", "hurried", "texture_db", "codec"),
+    [
+        (True, False, 32, TextureCodec.HTJ2K),
+        (False, True, 32, TextureCodec.HTJ2K),
+        (True, True, 32, TextureCodec.JPEG),
+        (True, True, 45, TextureCodec.HTJ2K),
+    ],
+)
+def test_in_a_hurry_a_fast_link_gets_jpeg_where_that_does(
+    scan: Scan, model: TextureModel, quick: bool, hurried: bool, texture_db: float, codec: TextureCodec
+) -> None:
+    bound = Bound(1, scan, build_first_view(scan, "htj2k", 32768).state, 2)
+    look = m.Look(2, 0.75, 0.5, texture_db=texture_db)
+    update = bound.plan(look, ("htj2k", "jpeg"), None, lambda: False, model, quick, hurried=hurried)
+    assert isinstance(update, Update)
+    assert {coded.codec for coded in update.coded if coded.channel is Channel.TEXTURE} == {codec}
+    assert update.texture_db is not None and update.texture_db >= texture_db
+
+
 def test_who_takes_jpeg_only_gets_its_best(scan: Scan) -> None:
     bound = Bound(1, scan, build_first_view(scan, "jpeg", 32768).state, 2)
     update = bound.plan(HARD, ("jpeg",), None, lambda: False, None, False)
