@@ -257,7 +257,7 @@ def _largest_quantum(trial: Trial, p: int, target_steps: float) -> int:
             high, high_error = guess, error
         if not high or high - low <= high * FINENESS:
             break
-        between = low * high
+        between = float(low * high)
         if not tried:
             share = ((AIM * target_steps) ** 2 - low_error**2) / (high_error**2 - low_error**2)
             between = low**2 + max(share, 0.0) * (high**2 - low**2)
