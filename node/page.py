@@ -16,6 +16,7 @@ MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
     ".wasm": "application/wasm",
     ".svg": "image/svg+xml",
+    ".txt": "text/plain; charset=utf-8",  # licences of others' work in the page; offline copies have them, too
 }
 # The build writes a hash of its content into every name but the page's own.
 FOR_EVER = "public, max-age=31536000, immutable"

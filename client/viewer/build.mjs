@@ -1,6 +1,7 @@
 // Bundles the page into a folder: `node build.mjs dist`. Names carry a hash of their content, so that they may be
 // cached for ever; the page itself names them. `node build.mjs --tests OUT` bundles the unit tests instead.
 import { build } from 'esbuild';
+import { createHash } from 'node:crypto';
 import { mkdir, readFile, readdir, rm, writeFile } from 'node:fs/promises';
 import { join } from 'node:path';
 import { constants, gzipSync } from 'node:zlib';
@@ -23,11 +24,22 @@ async function page(out) {
   const [worker, script, style] = ['worker.ts', 'main.ts', 'style.css'].map((entry) => named(outputs, `src/${entry}`));
   const define = { WORKER_FILE: JSON.stringify(worker), MAIN_FILE: JSON.stringify(script) };
   const boot = named((await build({ ...common, define, entryPoints: ['src/boot.ts'] })).metafile.outputs, 'src/boot.ts');
-  const names = { boot, script, style };
+  const wasm = Object.keys(outputs).find((path) => path.endsWith('.wasm')).split('/').at(-1);
+  const [scriptHash, styleHash] = await Promise.all([script, style, worker].map((name) => hashInline(join(out, name))));
+  const notices = await licenses();
+  const notice = `licenses-${createHash('sha256').update(notices).digest('hex').slice(0, 8)}.txt`;
+  const names = { boot, script, style, worker, wasm, notice, scriptHash, styleHash };
   const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name]);
   await writeFile(join(out, 'index.html'), html);
   for (const file of await readdir(out)) await squeeze(join(out, file));
-  await writeFile(join(out, 'licenses.txt'), await licenses());
+  await writeFile(join(out, notice), notices);
+}
+
+// Offline copies have scripts and style within the page, and a policy that lets these run alone: the hash it names them by.
+async function hashInline(path) {
+  const text = await readFile(path);
+  if (/<!--/.test(text) || new RegExp(path.endsWith('.css') ? '</style' : '</script', 'i').test(text)) throw new Error(`${path} cannot stand within a page`);
+  return `sha256-${createHash('sha256').update(text).digest('base64')}`;
 }
 
 // What is bundled is others' work: their licences travel with it.

@@ -2,82 +2,114 @@
 
 import { deleteScan, listScans, readAccount, readCapture } from './api.ts';
 import type { Sidecar } from './api.ts';
-import type { FromWorker, LinkState, ToWorker } from './link.ts';
-import { Measuring } from './measuring.ts';
+import { Comparison } from './comparison.ts';
+import { saveCopy } from './copy.ts';
+import type { Held } from './copy.ts';
+import type { Answer, FromWorker, LinkState, ToWorker } from './link.ts';
+import type { Measured, Measuring } from './measuring.ts';
 import { Pane } from './pane.ts';
+import { Pins } from './pins.ts';
 import type { ScanInfo } from './protocol/messages.ts';
 import { OpenSidecar } from './sidecar.ts';
 import { strings } from './strings.ts';
 import { Sweep } from './sweep.ts';
 import { AboutPanel } from './ui/about_panel.ts';
+import { ComparePanel } from './ui/compare_panel.ts';
 import { CostPanel } from './ui/cost_panel.ts';
 import { DisplayPanel } from './ui/display_panel.ts';
 import { Frame } from './ui/frame.ts';
 import { LookPanel } from './ui/look_panel.ts';
-import type { Tool } from './ui/look_panel.ts';
-import { PinsPanel } from './ui/pins_panel.ts';
+import { MeasurePanel } from './ui/measure_panel.ts';
 import { ScanList } from './ui/scan_list.ts';
 import { ScannerPanel } from './ui/scanner_panel.ts';
+import { kindOf } from './ui/tool_choice.ts';
+import type { Tool } from './ui/tool_choice.ts';
 import { WorthPanel } from './ui/worth_panel.ts';
 import { formatState, parseState } from './url_state.ts';
-import type { Pin, ViewState } from './url_state.ts';
+import type { ViewState } from './url_state.ts';
 import type { Place } from './view/room.ts';
 
 const CAPTURE_MS = 2000;
 const WRITE_MS = 200;
-const NOWHERE: ViewState = { scan: null, camera: null, foveae: [], pins: [] };
+const NOWHERE: ViewState = { scan: null, camera: null, foveae: [], pins: [], beside: null };
 
 export class App {
   private readonly frame: Frame;
   private readonly pane: Pane;
-  private readonly measuring: Measuring;
+  /** What a point was added to last. */
+  private latest: Measuring;
+  private readonly comparison: Comparison;
+  private readonly comparePanel: ComparePanel;
   private readonly scans: ScanList;
   private readonly scanner = new ScannerPanel(() => void this.sweep.start(), () => this.sweep.watch());
-  private readonly look = new LookPanel(() => this.sharpen(this.pane.stage.pickMiddle()), (tool) => this.toolChanged(tool));
+  private readonly look = new LookPanel(() => this.sharpen(this.pane, this.pane.stage.sight.pickMiddle()), (tool) => this.toolChanged(tool));
+  private readonly measurePanel = new MeasurePanel(() => this.latest.undo(), () => this.beginMeasuring());
   private readonly display: DisplayPanel;
   private readonly cost = new CostPanel();
-  private readonly pinsPanel: PinsPanel;
+  private readonly pins: Pins;
   private readonly worth = new WorthPanel();
   private readonly about: AboutPanel;
   private readonly sweep: Sweep;
   private readonly sidecar: OpenSidecar;
 
   private state = parseState(location.hash.slice(1));
+  /** The scan to be opened next is what the address asks for. */
+  private isAddressed = true;
   private mayChange = false;
+  private node = '';
+  private isCopyNamed = false;
   private writing: ReturnType<typeof setTimeout> | undefined;
 
   constructor(
     root: HTMLElement, private readonly worker: Worker, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
+    hire: (scan: string) => Worker,
   ) {
     const say = (text: string) => this.frame.say(text);
     this.frame = new Frame(root, {
       retry: () => this.tell({ kind: 'retry' }), zoom: (steps) => this.pane.stage.zoom(steps), home: () => this.home(),
     });
     canvas.id = 'view';
-    this.pane = new Pane(worker, canvas, context, () => this.look.options, {
-      say,
+    const shared = {
+      say, options: () => this.look.options, home: () => this.home(), undone: () => this.latest.undo(), changed: () => this.writeState(),
+      received: (bytes: number) => this.cost.traffic(bytes), updated: (answer: Answer) => this.cost.answered(answer),
+      measured: (measured: Measured) => this.measured(measured),
+    };
+    this.pane = new Pane((message) => this.tell(message), canvas, context, {
+      ...shared,
       opened: (info, fresh, framed) => this.opened(info, fresh, framed),
-      updated: (answer) => this.cost.answered(answer),
       missing: () => this.missing(),
-      clicked: (place) => this.clicked(place),
-      hovered: (place) => this.hovered(place),
-      home: () => this.home(),
-      changed: () => this.writeState(),
+      clicked: (place) => this.clicked(this.pane, place),
+      hovered: (place) => this.hovered(this.pane, place),
+      moved: () => this.comparison?.moved(this.pane),
     }, document.documentElement);
-    this.measuring = new Measuring(this.pane.stage, this.pane.marks, say);
+    this.latest = this.pane.measuring;
+    this.comparison = new Comparison(this.pane, this.frame.pictures, hire, {
+      ...shared,
+      clicked: (place) => this.clicked(this.comparison.picture!, place),
+      hovered: (place) => this.hovered(this.comparison.picture!, place),
+      changed: () => {
+        this.showComparison();
+        this.writeState();
+      },
+    });
+    this.comparePanel = new ComparePanel({
+      choose: (scan) => (scan ? this.comparison.open({ scan, camera: null, foveae: [] }) : this.comparison.close()),
+      together: (on) => this.comparison.link(on),
+      sharpenBoth: (on) => (this.comparison.moves.sharpenBoth = on),
+      align: () => this.comparison.align(),
+    });
     this.sweep = new Sweep(this.pane.stage, this.scanner, {
       say, watched: () => this.watched(), ended: (scan) => this.sweepEnded(scan), changed: () => void this.refreshCapture(),
     });
     this.sidecar = new OpenSidecar({ say, known: (scan, sidecar) => this.takeSidecar(scan, sidecar) });
     this.scans = new ScanList((id) => this.open(id), (scan) => this.tell({ kind: 'thumbnail', scan }));
-    this.pinsPanel = new PinsPanel((pin) => void this.keepPins([...this.state.pins, pin]),
-      (index) => void this.keepPins(this.state.pins.filter((_, at) => at !== index)), (pin) => this.goTo(pin));
-    this.about = new AboutPanel((changes) => void this.sidecar.save(changes, true), () => void this.remove());
-    this.display = new DisplayPanel((shading, overlay) => this.pane.stage.setLook(shading, overlay));
+    this.pins = new Pins(this.pane, this.sidecar, () => this.writeState());
+    this.about = new AboutPanel((changes) => void this.sidecar.save(changes, true), () => void this.remove(), (named) => this.copy(named));
+    this.display = new DisplayPanel(() => this.showAs());
     this.frame.pictures.append(this.pane.element);
     this.frame.stage.append(this.display.legend);
-    this.frame.add(this.scans.element, this.scanner.element, this.look.element, this.display.element, this.pinsPanel.element,
-      this.worth.element, this.cost.element, this.about.element);
+    this.frame.add(...[this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel, this.display,
+      this.pins.panel, this.worth, this.cost, this.about].map(({ element }) => element));
     addEventListener('hashchange', () => this.addressChanged());
     addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
@@ -110,11 +142,11 @@ export class App {
       case 'liveEnded':
         this.sweep.ended(said.scan, said.why);
         break;
+      case 'recorded':
+        this.recorded(said.info, said.refinements);
+        break;
       case 'thumbnail':
         this.scans.picture(said.scan, said.picture);
-        break;
-      case 'traffic':
-        this.cost.traffic(said.received);
         break;
       default:
         this.pane.hear(said);
@@ -124,7 +156,10 @@ export class App {
   private linked(link: LinkState): void {
     this.frame.linked(link);
     if (link.state === 'connecting') return;
-    if (link.state === 'ready') this.allow(link.role !== 'view');
+    if (link.state === 'ready') {
+      this.node = link.node;
+      this.allow(link.role !== 'view');
+    }
     void this.refreshScans();
     void this.refreshCapture();
   }
@@ -134,9 +169,8 @@ export class App {
     this.mayChange = mayChange;
     this.frame.allow(mayChange);
     this.scanner.allow(mayChange);
-    this.look.allowPins(mayChange);
-    this.pinsPanel.allow(mayChange);
-    this.showPins();
+    this.look.tools.allow('pin', mayChange);
+    this.pins.allow(mayChange);
   }
 
   private opened(info: ScanInfo, fresh: boolean, framed: boolean): void {
@@ -145,6 +179,7 @@ export class App {
     if (!fresh) return;
     this.scans.mark(info.id);
     this.about.show(info);
+    this.showComparison();
     if (framed) this.restoreState(info.id);
     void this.sidecar.open(info.id);
     void this.readWorth(info.id);
@@ -153,12 +188,14 @@ export class App {
   /** What the address asks for, when it is about this scan; else a clean view of it. */
   private restoreState(scan: string): void {
     const meant = this.state.scan === scan;
-    const { camera, foveae, pins } = meant ? this.state : NOWHERE;
-    this.state = { ...NOWHERE, scan, pins };
+    const { camera, foveae, pins, beside } = meant ? this.state : NOWHERE;
+    this.state = { ...NOWHERE, scan };
     if (camera) this.pane.stage.place(camera);
-    this.measuring.clear();
-    this.showPins();
+    this.beginMeasuring();
+    this.pins.show(pins);
     this.pane.sharpenAll(foveae);
+    if (this.isAddressed && beside) this.comparison.open(beside);
+    else if (this.isAddressed || this.comparison.state?.scan === scan) this.comparison.close();
     this.writeState();
   }
 
@@ -172,8 +209,9 @@ export class App {
   /** The picture shows a sweep: nothing that was marked on a scan belongs there. */
   private watched(): void {
     this.frame.showEmpty(false);
+    this.comparison.close();
     this.pane.marks.setPins([]);
-    this.measuring.clear();
+    this.beginMeasuring();
   }
 
   private sweepEnded(scan: string | null): void {
@@ -185,26 +223,28 @@ export class App {
 
   private open(id: string): void {
     this.state = { ...NOWHERE, scan: id };
+    this.isAddressed = false;
     this.pane.open(id);
   }
 
-  private clicked(place: Place | null): void {
+  private clicked(pane: Pane, place: Place | null): void {
     if (this.sweep.isWatched) return;
-    const { tool } = this.look;
-    if (place && tool === 'measure') this.measuring.add(place);
-    else if (place && tool === 'pin') this.pinsPanel.ask(place);
-    else this.sharpen(place);
+    const { tool } = this.look.tools;
+    if (!place || !(kindOf(tool) || tool === 'pin')) return this.sharpen(pane, place);
+    if (tool === 'pin') return pane === this.pane ? this.pins.panel.ask(place) : this.frame.say(strings.compare.pins);
+    this.latest = pane.measuring;
+    this.latest.add(place);
   }
 
-  private sharpen(place: Place | null): void {
+  private sharpen(pane: Pane, place: Place | null): void {
     if (this.sweep.isWatched) return;
-    if (place) this.pane.sharpen(place);
+    if (place) this.comparison.sharpen(pane, place);
     else this.frame.say(strings.view.missed);
   }
 
-  private hovered(seek: () => Place | null): void {
+  private hovered(pane: Pane, seek: () => Place | null): void {
     const place = this.look.follow && !this.sweep.isWatched ? seek() : null;
-    if (place) this.pane.sharpen(place);
+    if (place) this.comparison.sharpen(pane, place);
   }
 
   private home(): void {
@@ -214,39 +254,47 @@ export class App {
 
   private toolChanged(tool: Tool): void {
     this.frame.hintAt(tool);
-    if (tool !== 'pin') this.pinsPanel.ask(null);
-    this.measuring.clear();
-    if (tool === 'measure') this.frame.say(strings.measure.first);
+    if (tool !== 'pin') this.pins.panel.ask(null);
+    this.beginMeasuring();
   }
 
-  private goTo(pin: Pin): void {
-    if (!this.pane.info) return;
-    this.pane.stage.face(pin);
-    this.writeState();
+  private beginMeasuring(): void {
+    for (const pane of [this.comparison.picture, this.pane]) pane?.measuring.begin(kindOf(this.look.tools.tool) ?? 'distance');
+  }
+
+  private showAs(): void {
+    const { shading, overlay } = this.display;
+    for (const pane of [this.pane, this.comparison.picture]) pane?.stage.setLook(shading, overlay);
+  }
+
+  private showComparison(): void {
+    const [open, beside] = [this.pane.info?.id ?? null, this.comparison.state?.scan ?? null];
+    const title = (id: string | null) => {
+      const scan = this.scans.scans.find((one) => one.id === id);
+      return scan ? strings.scans.title(scan) : strings.scans.untitled;
+    };
+    this.comparePanel.show(this.scans.scans, open, beside);
+    this.frame.caption(title(open), beside && title(beside), () => this.comparison.close());
+    this.showAs();
+  }
+
+  private measured(measured: Measured): void {
+    const isAsked = kindOf(this.look.tools.tool) !== null;
+    this.measurePanel.show(isAsked ? measured : null);
+    if (measured.alongMm !== null) this.frame.say(strings.measure.said(measured));
+    else if (isAsked) this.frame.say(strings.measure.advice(measured));
   }
 
   // What is kept at the node
-
-  private async keepPins(pins: Pin[]): Promise<void> {
-    this.state.pins = pins;
-    this.showPins();
-    this.writeState();
-    await this.sidecar.save({ pins }, false);
-  }
 
   private takeSidecar(scan: string, sidecar: Sidecar | null): void {
     this.about.said(sidecar, this.mayChange);
     if (sidecar) {
       this.scans.said(scan, sidecar);
-      this.state.pins = sidecar.pins;
+      this.showComparison();
     }
-    this.showPins();
+    this.pins.show(sidecar?.pins ?? this.pins.list);
     this.writeState();
-  }
-
-  private showPins(): void {
-    this.pinsPanel.show(this.state.pins, this.sidecar.isKept);
-    this.pane.marks.setPins(this.state.pins);
   }
 
   private async remove(): Promise<void> {
@@ -259,8 +307,9 @@ export class App {
       return;
     }
     this.sidecar.close();
+    this.comparison.close();
     this.pane.clear();
-    this.measuring.clear();
+    this.beginMeasuring();
     this.about.hide();
     this.worth.hide();
     this.state = { ...NOWHERE };
@@ -276,6 +325,7 @@ export class App {
   private async refreshScans(): Promise<void> {
     try {
       this.scans.show(await listScans());
+      this.showComparison();
     } catch {
       return; // the line above the picture says why
     }
@@ -289,6 +339,25 @@ export class App {
     }
   }
 
+  // An offline copy
+
+  private copy(named: boolean): void {
+    this.isCopyNamed = named;
+    this.frame.say(strings.copy.making);
+    this.tell({ kind: 'record' });
+  }
+
+  private recorded(info: ScanInfo, refinements: Uint8Array | null): void {
+    const scan = this.scans.scans.find(({ id }) => id === info.id);
+    const { shading, overlay } = this.display;
+    const view = formatState({ scan: info.id, camera: this.pane.stage.placed, foveae: this.pane.foveae, pins: this.pins.list, beside: null });
+    const held: Held = {
+      info, view, shading, overlay, made: new Date().toISOString(), swept: scan?.created ?? null, node: this.node,
+      about: this.isCopyNamed && scan ? strings.scans.about(scan) : '',
+    };
+    void saveCopy(held, refinements, (text) => this.frame.say(text));
+  }
+
   // The address
 
   /** Soon, and once for any number of calls: browsers take it slowly, and not too often. */
@@ -297,13 +366,14 @@ export class App {
       this.writing = undefined;
       const { info, foveae, stage } = this.pane;
       if (!info || this.sweep.isWatched) return;
-      const fragment = formatState({ ...this.state, scan: info.id, camera: stage.placed, foveae });
+      const fragment = formatState({ ...this.state, scan: info.id, camera: stage.placed, foveae, pins: this.pins.list, beside: this.comparison.state });
       history.replaceState(null, '', `#${fragment}`);
     }, WRITE_MS);
   }
 
   private addressChanged(): void {
     this.state = parseState(location.hash.slice(1));
+    this.isAddressed = true;
     this.pane.open(this.state.scan ?? 'latest');
   }
 }

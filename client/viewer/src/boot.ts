@@ -5,14 +5,20 @@ import { CONTEXT } from './link.ts';
 import type { FromWorker } from './link.ts';
 import { parseState } from './url_state.ts';
 
-const worker = new Worker(new URL(WORKER_FILE, import.meta.url), { type: 'module' });
+/** A worker with a stream of its own, that opens a scan. */
+function hire(scan: string): Worker {
+  const worker = new Worker(new URL(WORKER_FILE, import.meta.url), { type: 'module' });
+  worker.postMessage({ kind: 'start', origin: location.origin, scan });
+  return worker;
+}
+
+const worker = hire(parseState(location.hash.slice(1)).scan ?? 'latest');
 const said: MessageEvent<FromWorker>[] = [];
 const started = new Promise((resolve) => {
   worker.onmessage = (event: MessageEvent<FromWorker>) => resolve(said.push(event));
 });
-worker.postMessage({ kind: 'start', origin: location.origin, scan: parseState(location.hash.slice(1)).scan ?? 'latest' });
 const canvas = document.createElement('canvas');
 const context = canvas.getContext('webgl2', CONTEXT);
 await started;
 const { main } = (await import(new URL(MAIN_FILE, import.meta.url).href)) as typeof import('./main.ts');
-setTimeout(() => main({ worker, said, canvas, context }));
+setTimeout(() => main({ worker, said, canvas, context, hire }));

@@ -19,6 +19,8 @@ export type ToWorker =
   | { kind: 'look'; look: number; u: number; v: number; options: LookOptions }
   | { kind: 'cancel'; look: number }
   | { kind: 'restore' }
+  | { kind: 'record' }
+  | { kind: 'replay'; info: ScanInfo; refinements: Uint8Array; wasm: ArrayBuffer }
   | { kind: 'retry' }
   | { kind: 'thumbnail'; scan: string };
 
@@ -28,6 +30,8 @@ export interface Boot {
   said: MessageEvent<FromWorker>[];
   canvas: HTMLCanvasElement;
   context: WebGL2RenderingContext | null;
+  /** One more worker, for a scan of its own. */
+  hire(scan: string): Worker;
 }
 
 /** Edges are smooth because the picture is drawn larger than shown. It is kept, so that a part of it can be drawn anew. */
@@ -63,6 +67,8 @@ export type FromWorker =
   | { kind: 'link'; link: LinkState }
   | { kind: 'opened'; snapshot: Snapshot; fresh: boolean }
   | { kind: 'restored' }
+  | { kind: 'broken' }
+  | { kind: 'recorded'; info: ScanInfo; refinements: Uint8Array<ArrayBuffer> | null }
   | { kind: 'patch'; channel: Channel; changed: Changed[]; level: Uint8Array }
   | { kind: 'updated'; answer: Answer }
   | { kind: 'refused'; look: number; code: string; message: string }

@@ -1,6 +1,8 @@
 // One picture with one scan in it: shows what the worker says of it, and asks for detail, one look after the other.
 
 import type { Answer, FromWorker, LookOptions, ToWorker } from './link.ts';
+import { Measuring } from './measuring.ts';
+import type { Measured } from './measuring.ts';
 import type { ScanInfo } from './protocol/messages.ts';
 import { strings } from './strings.ts';
 import { assign, h } from './ui/dom.ts';
@@ -10,10 +12,12 @@ import type { Place } from './view/room.ts';
 import { Stage } from './view/stage.ts';
 
 /** What a worker says of the scan it has open. */
-export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'updated' | 'refused' }>;
+export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'updated' | 'refused' | 'traffic' | 'broken' }>;
 
 export interface PaneEvents {
   say(text: string): void;
+  /** How sharp the next look shall be. */
+  options(): LookOptions;
   /** A scan is in the picture. fresh: asked for by us; framed: another than before, with the camera where it sees all. */
   opened(info: ScanInfo, fresh: boolean, framed: boolean): void;
   /** A look was answered, not superseded. */
@@ -25,6 +29,14 @@ export interface PaneEvents {
   /** The pointer is there. */
   hovered(place: () => Place | null): void;
   home(): void;
+  /** Lengths were measured on it, or are no more. */
+  measured(measured: Measured): void;
+  /** The last point shall be taken back. */
+  undone(): void;
+  /** The camera moves. */
+  moved(): void;
+  /** So many bytes have come. */
+  received(bytes: number): void;
   /** The camera has come to rest, or there is one more fovea: the view is another one. */
   changed(): void;
 }
@@ -33,6 +45,7 @@ export class Pane {
   readonly element: HTMLElement;
   readonly stage: Stage;
   readonly marks: Marks;
+  readonly measuring: Measuring;
   /** The scan in the picture; null while another one is on its way. */
   info: ScanInfo | null = null;
   /** Where detail was got, in order. */
@@ -40,31 +53,38 @@ export class Pane {
   private looks = 0;
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
+  private bytes = 0;
+  private readonly noted: HTMLElement;
 
-  /** noted: where tests read how things stand. */
+  /** noted: where it stands to be read how far things are; its own element, if nothing else. */
   constructor(
-    private readonly worker: Worker, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
-    private readonly options: () => LookOptions, private readonly events: PaneEvents, private readonly noted: HTMLElement,
+    private readonly tell: (message: ToWorker) => void, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
+    private readonly events: PaneEvents, noted?: HTMLElement,
   ) {
     const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
     assign(canvas, { tabindex: 0, role: 'application', 'aria-label': strings.view.label });
     this.element = h('div', { class: 'picture' }, canvas);
+    this.noted = noted ?? this.element;
     this.stage = new Stage(canvas, context, {
       drawn: () => this.marks?.update(),
+      moved: () => this.events.moved(),
       settled: () => this.events.changed(),
       lost: () => this.events.say(strings.link.graphicsLost),
       restored: () => this.restore(),
     }, calm);
-    this.marks = new Marks(this.stage);
+    this.marks = new Marks(this.stage.sight);
+    this.measuring = new Measuring(this.stage.sight, this.marks, (measured) => this.events.measured(measured));
     this.element.append(this.marks.element);
     listen(canvas, {
-      click: (x, y) => this.events.clicked(this.stage.pick(x, y)),
-      hover: (x, y) => this.events.hovered(() => this.stage.pick(x, y)),
+      click: (x, y) => this.events.clicked(this.stage.sight.pick(x, y)),
+      hover: (x, y) => this.events.hovered(() => this.stage.sight.pick(x, y)),
       turn: (across, up) => this.stage.turn(across, up),
       pan: (right, up) => this.stage.pan(right, up),
       zoom: (steps) => this.stage.zoom(steps),
       home: () => this.events.home(),
-      act: () => this.events.clicked(this.stage.pickMiddle()),
+      act: () => this.events.clicked(this.stage.sight.pickMiddle()),
+      undo: () => this.events.undone(),
+      cancel: () => this.cancel(),
     });
   }
 
@@ -85,6 +105,13 @@ export class Pane {
       case 'refused':
         this.refused(said);
         break;
+      case 'broken':
+        this.events.say(strings.copy.broken);
+        break;
+      case 'traffic':
+        this.events.received(said.received - this.bytes);
+        this.bytes = said.received;
+        break;
     }
   }
 
@@ -102,8 +129,11 @@ export class Pane {
   /** Show nothing. */
   clear(): void {
     this.info = null;
+    this.endLook();
+    [this.queue, this.bytes] = [[], 0];
     this.stage.clear();
     this.marks.setPins([]);
+    this.measuring.clear();
   }
 
   /** Get detail at a place, whatever was asked for before. */
@@ -113,15 +143,17 @@ export class Pane {
     this.ask(place);
   }
 
+  /** Want no more of what is on its way. */
+  cancel(): void {
+    this.queue = [];
+    if (this.looking) this.tell({ kind: 'cancel', look: this.looking.look });
+  }
+
   /** Get detail at places, one after the other. */
   sharpenAll(places: Place[]): void {
     this.foveae = [];
     this.queue = [...places];
     this.next();
-  }
-
-  private tell(message: ToWorker): void {
-    this.worker.postMessage(message);
   }
 
   private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {
@@ -131,6 +163,7 @@ export class Pane {
       this.stage.show(snapshot, framed);
     } catch (error) {
       if (!(error instanceof RangeError)) throw error;
+      this.clear(); // what was there before is another scan
       this.events.say(strings.tooLarge);
       return;
     }
@@ -143,6 +176,7 @@ export class Pane {
     const counts = answer.reason !== 'superseded';
     if (counts) {
       this.noted.dataset['updates'] = String(Number(this.noted.dataset['updates'] ?? 0) + 1);
+      this.measuring.renew();
       this.events.updated(answer);
     }
     if (answer.look !== this.looking?.look) return;
@@ -163,7 +197,7 @@ export class Pane {
     this.looking = { look, place };
     this.marks.setBusy(place);
     this.noted.dataset['looking'] = 'yes';
-    this.tell({ kind: 'look', look, u: place.u, v: place.v, options: this.options() });
+    this.tell({ kind: 'look', look, u: place.u, v: place.v, options: this.events.options() });
   }
 
   private next(): void {

@@ -1,11 +1,11 @@
 // The conversation with the node: connects, goes on after a cut, applies what comes in order, and tells the page.
 
 import { backoffMs } from './backoff.ts';
-import type { Answer, FromWorker, LinkState, LookOptions, Snapshot } from './link.ts';
+import type { Answer, FromWorker, LinkState, LookOptions } from './link.ts';
 import { LivePicture } from './live_picture.ts';
 import type { Codecs } from './protocol/codec.ts';
 import { HoldingsDiffer, RemoteWireError } from './protocol/errors.ts';
-import { CHANNELS, TEXTURE } from './protocol/lattice.ts';
+import { TEXTURE } from './protocol/lattice.ts';
 import { isLive, parseLive } from './protocol/live.ts';
 import { parseMessage, PROTOCOL } from './protocol/messages.ts';
 import type { FromClient, FromNode, Look, Updated } from './protocol/messages.ts';
@@ -13,6 +13,9 @@ import { Model } from './protocol/model.ts';
 import type { Changed } from './protocol/model.ts';
 import { COARSE, parseRefinement } from './protocol/refinement.ts';
 import type { Refinement } from './protocol/refinement.ts';
+import { Recording } from './recording.ts';
+import { inParts, tellAll } from './telling.ts';
+import type { Tell } from './telling.ts';
 
 const CLIENT = 'foveascan viewer';
 const VIOLATION = 4002;
@@ -26,7 +29,6 @@ interface Looking {
   applyMs: number;
 }
 
-export type Tell = (message: FromWorker, transfer?: Transferable[]) => void;
 /** Why there is no connection, in words for people. */
 export type Explain = () => Promise<string>;
 
@@ -37,6 +39,7 @@ export class Stream {
   private timer: ReturnType<typeof setTimeout> | undefined;
   private node: { name: string; version: string } | null = null;
   private model: Model | null = null;
+  private recording: Recording | null = null;
   /** The scan that the page wants to see. */
   private wanted: string | null = null;
   /** Asked for by the page, and not told it yet. */
@@ -109,12 +112,20 @@ export class Stream {
     });
   }
 
+  /** Tell the page what was received of the open scan. */
+  record(): void {
+    this.work = this.work.then(() => {
+      if (!this.model?.complete || !this.recording) return;
+      this.tell({ kind: 'recorded', info: this.model.info, refinements: this.recording.toBytes() });
+    });
+  }
+
   private async take(socket: WebSocket, data: string | ArrayBuffer): Promise<void> {
     if (socket !== this.socket) return;
     if (typeof data === 'string') return this.hear(parseMessage(data), data.length);
     const bytes = new Uint8Array(data);
     if (isLive(bytes)) return this.showLive(bytes);
-    await this.refine(parseRefinement(bytes), bytes.length);
+    await this.refine(parseRefinement(bytes), bytes);
   }
 
   private hear(said: FromNode, size: number): void {
@@ -172,9 +183,10 @@ export class Stream {
     }
     this.wanted = scan.id;
     this.model = new Model(scan, epoch);
+    this.recording = new Recording(scan);
   }
 
-  private async refine(refinement: Refinement, size: number): Promise<void> {
+  private async refine(refinement: Refinement, message: Uint8Array): Promise<void> {
     const model = this.model;
     if (!model || refinement.epoch !== model.epoch) return; // of an opening that a newer one has overtaken
     const began = performance.now();
@@ -187,16 +199,17 @@ export class Stream {
       this.say(model.object());
       return;
     }
+    this.recording?.add(message);
     const applyMs = performance.now() - began;
     this.applyMs += applyMs;
     if (refinement.generator === COARSE) return this.firstView(model);
     if (this.looking && refinement.look === this.request) {
-      this.looking.bytes += size;
+      this.looking.bytes += message.length;
       this.looking.applyMs += applyMs;
     }
     const { channel } = refinement;
     const level = model.holdings.channels[channel].level.slice();
-    this.patches.push({ kind: 'patch', channel, changed, level });
+    this.patches.push(...inParts(changed).map((part) => ({ kind: 'patch', channel, changed: part, level }) as const));
   }
 
   /**
@@ -314,23 +327,8 @@ export class Stream {
 
   /** All that we hold of a scan whose first view is in. */
   private tellAll(): void {
-    const model = this.model!;
     this.patches = []; // the snapshot has them
-    const [range, texture] = CHANNELS.map((channel) => model.holdings.channels[channel].level.slice());
-    const snapshot = { info: model.info, steps: model.steps.slice(), coarseTexels: model.coarseTexels.slice(), levels: [range!, texture!] } as Snapshot;
-    const buffers = [snapshot.steps.buffer as ArrayBuffer, snapshot.coarseTexels.buffer as ArrayBuffer];
-    this.tell({ kind: 'opened', snapshot, fresh: this.unseen }, buffers);
+    tellAll(this.model!, this.unseen, this.tell);
     this.unseen = false;
-    if (model.hasTexels) this.tellAllTexels(model);
-  }
-
-  private tellAllTexels(model: Model): void {
-    const { textureWidth: width, textureHeight: height } = model.info;
-    const level = model.holdings.channels[TEXTURE].level.slice();
-    for (let y = 0; y < height; y += 256) {
-      const rows = Math.min(256, height - y);
-      const cells = new Uint8Array(model.texels.slice(y * width, (y + rows) * width).buffer);
-      this.tell({ kind: 'patch', channel: TEXTURE, changed: [{ x: 0, y, width, height: rows, cells }], level }, [cells.buffer]);
-    }
   }
 }

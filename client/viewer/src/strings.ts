@@ -1,6 +1,13 @@
 // Every word the page says, in one place.
 
-import type { Quality } from './api.ts';
+import type { Quality, ScanSummary } from './api.ts';
+import type { Held } from './copy.ts';
+import type { Measured } from './measuring.ts';
+
+const millimetres = (mm: number): string => `${mm < 100 ? mm.toFixed(2) : mm.toFixed(1)} mm`;
+
+const moment = (iso: string): string => when(Date.parse(iso) / 1000);
+const when = (unixS: number): string => new Date(1000 * unixS).toLocaleString(undefined, { dateStyle: 'medium', timeStyle: 'short' });
 
 export const strings = {
   title: 'foveascan',
@@ -18,11 +25,13 @@ export const strings = {
     graphicsLost: 'The graphics card was reset; drawing again…',
   },
   view: {
-    label: '3D view of the scan. Arrow keys turn it, plus and minus zoom, Shift and arrows move it, Enter sharpens the middle, Home shows everything.',
+    label: '3D view of the scan. Arrow keys turn it, plus and minus zoom, Shift and arrows move it, Enter sharpens the middle or sets a point there, Backspace takes a point back, Escape stops what is coming, Home shows everything.',
     empty: 'No scan yet. Start a sweep, and watch it appear here.',
     hints: {
+      turn: 'Drag to turn · wheel to zoom',
       sharpen: 'Click to sharpen · drag to turn · wheel to zoom',
       measure: 'Click two points to measure · drag to turn · wheel to zoom',
+      path: 'Click along the path, point by point · drag to turn · wheel to zoom',
       pin: 'Click where the pin goes · drag to turn · wheel to zoom',
     },
     live: (percent: number, seconds: number | null) =>
@@ -36,6 +45,9 @@ export const strings = {
     heading: 'Scans',
     none: 'None yet.',
     untitled: 'Scan',
+    when,
+    about: ({ name, subject, bodySite }: ScanSummary) => [name, subject, bodySite].filter(Boolean).join(' · '),
+    title: ({ name, created }: ScanSummary) => `${name || 'Scan'} · ${when(created)}`,
     site: (subject: string, site: string) => [subject, site].filter(Boolean).join(' · '),
   },
   scanner: {
@@ -54,7 +66,7 @@ export const strings = {
   look: {
     heading: 'Sharpness',
     tool: 'A click',
-    tools: { sharpen: 'sharpens', measure: 'measures', pin: 'sets a pin' },
+    tools: { turn: 'turns only', sharpen: 'sharpens', measure: 'measures', path: 'traces a path', pin: 'sets a pin' },
     here: 'Sharpen the middle',
     follow: 'Follow my pointer',
     time: 'Time limit',
@@ -75,11 +87,40 @@ export const strings = {
     legend: 'Spacing held, in samples: 1 is everything there is',
   },
   measure: {
-    heading: 'Distance',
-    first: 'Click the first point.',
-    second: 'Click the second point.',
-    result: (mm: number) => `${mm < 100 ? mm.toFixed(2) : mm.toFixed(1)} mm`,
-    straight: 'straight from point to point',
+    heading: 'Measured',
+    result: millimetres,
+    along: (mm: number) => `${millimetres(mm)} along the surface`,
+    said: ({ straightMm, alongMm, kind }: Measured) =>
+      `${kind === 'distance' ? `${millimetres(straightMm!)} straight, ` : ''}${millimetres(alongMm!)} along the surface`,
+    figures: ({ count, kind, straightMm, alongMm, gapsMm }: Measured): [string, string][] => [
+      ['Straight, end to end', straightMm === null ? '–' : millimetres(straightMm)],
+      ['Along the surface', alongMm === null ? '–' : millimetres(alongMm)],
+      ...(gapsMm > 0 ? [['of it over gaps', millimetres(gapsMm)] as [string, string]] : []),
+      ...(kind === 'path' ? [['Points', String(count)] as [string, string]] : []),
+    ],
+    advice: ({ kind, count, isSharp }: Measured) => {
+      if (count === 0) return 'Click the first point.';
+      if (count === 1) return kind === 'path' ? 'Click the next point.' : 'Click the second point.';
+      if (!isSharp) return 'Not all of these points are sharp yet: sharpen there, and the figures will follow.';
+      return kind === 'path' ? 'Click on for a longer path.' : 'Click for another distance.';
+    },
+    undo: 'Take a point back',
+    anew: 'Start anew',
+  },
+  compare: {
+    heading: 'Compare',
+    beside: 'Beside the open scan',
+    none: 'nothing',
+    same: (subject: string) => `Also of ${subject}`,
+    others: 'Others',
+    together: 'Move both together',
+    both: 'Sharpen both',
+    how: 'If they do not stand alike: let go of “Move both together”, turn one, and take it up again. Together both have one scale.',
+    align: 'Same view of both',
+    close: 'Close the comparison',
+    missing: 'The scan beside is not there any more.',
+    noPicture: 'This browser draws no second picture.',
+    pins: 'Pins are set on the open scan, the one at the left.',
   },
   pins: {
     heading: 'Pins',
@@ -110,6 +151,30 @@ export const strings = {
     copied: 'The link is in the clipboard.',
     address: 'The page’s address is the link to this view.',
     samples: (width: number, height: number, tw: number, th: number) => `${width} × ${height} points, ${tw} × ${th} texels`,
+  },
+  copy: {
+    make: 'Offline copy of this view…',
+    heading: 'Offline copy',
+    what: 'One file that shows this view: shape and colour as sharp as you hold them now, with the pins. Any current browser opens it, without the node.',
+    beware: 'It is patient data: whoever has the file sees it, without a login, for good.',
+    named: 'Say in it whose scan it is: name, subject code, body site',
+    no: 'Cancel',
+    yes: 'Save the file',
+    making: 'The copy is being made…',
+    saved: (size: number) => `The copy is among your downloads, ${(size / 1e6).toFixed(1)} MB.`,
+    tooMuch: 'So much detail is held that a file of it would be too large. Load the page anew, sharpen what matters, and try again.',
+    broken: 'This file is damaged: what it holds cannot be shown. Ask for another copy.',
+    said: ({ made }: Held) => `Offline copy, made ${moment(made)}`,
+    tools: 'Tools',
+    explain: 'What somebody held of a scan. Nothing is fetched and nothing is sent: what is coarse here stays coarse.',
+    figures: ({ about, swept, made, node }: Held, places: number): [string, string][] => [
+      ...(about ? [['Scan', about] as [string, string]] : []),
+      ...(swept === null ? [] : [['Scanned', when(swept)] as [string, string]]),
+      ['Copied', moment(made)],
+      ['From', node],
+      ['Places sharpened', String(places)],
+    ],
+    file: ({ about, made }: Held) => `${about ? about.replaceAll(' · ', ' ') : 'scan'}, copy of ${made.slice(0, 10)}.html`,
   },
   worth: {
     heading: 'What it is worth',

@@ -7,11 +7,19 @@ export interface Pin extends Place {
   label: string;
 }
 
+/** A scan beside the one that is open, and the view of it. */
+export interface Beside {
+  scan: string;
+  camera: CameraPlace | null;
+  foveae: Place[];
+}
+
 export interface ViewState {
   scan: string | null;
   camera: CameraPlace | null;
   foveae: Place[];
   pins: Pin[];
+  beside: Beside | null;
 }
 
 const FOVEAE_MAX = 24;
@@ -19,28 +27,42 @@ const PINS_MAX = 100;
 const LABEL_MAX = 200;
 
 /** The fragment of an address, without '#'. */
-export function formatState({ scan, camera, foveae, pins }: ViewState): string {
+export function formatState({ scan, camera, foveae, pins, beside }: ViewState): string {
   const fields = new URLSearchParams();
   if (scan) fields.set('scan', scan);
-  if (camera) {
-    const { azimuth, elevation, distance, target } = camera;
-    fields.set('camera', [azimuth.toFixed(4), elevation.toFixed(4), ...[distance, ...target].map((mm) => mm.toFixed(2))].join(','));
-  }
-  for (const { u, v } of foveae.slice(-FOVEAE_MAX)) fields.append('fovea', `${u.toFixed(5)},${v.toFixed(5)}`);
+  const add = (prefix: string, camera: CameraPlace | null, foveae: Place[]) => {
+    if (camera) fields.set(`${prefix}camera`, formatCamera(camera));
+    for (const { u, v } of foveae.slice(-FOVEAE_MAX)) fields.append(`${prefix}fovea`, `${u.toFixed(5)},${v.toFixed(5)}`);
+  };
+  add('', camera, foveae);
   for (const { u, v, label } of pins.slice(0, PINS_MAX)) fields.append('pin', `${u.toFixed(5)},${v.toFixed(5)},${label}`);
+  if (beside) {
+    fields.set('beside', beside.scan);
+    add('beside-', beside.camera, beside.foveae);
+  }
   return fields.toString();
 }
 
 /** Inverse of formatState; what makes no sense is left out. */
 export function parseState(fragment: string): ViewState {
   const fields = new URLSearchParams(fragment);
-  const scan = fields.get('scan');
+  const view = (prefix: string) => ({
+    camera: parseCamera(fields.get(`${prefix}camera`)),
+    foveae: fields.getAll(`${prefix}fovea`).slice(-FOVEAE_MAX).flatMap((text) => parsePlace(text) ?? []),
+  });
+  const beside = parseId(fields.get('beside'));
   return {
-    scan: scan && /^[\w-]{1,200}$/.test(scan) ? scan : null,
-    camera: parseCamera(fields.get('camera')),
-    foveae: fields.getAll('fovea').slice(-FOVEAE_MAX).flatMap((text) => parsePlace(text) ?? []),
+    scan: parseId(fields.get('scan')),
+    ...view(''),
     pins: fields.getAll('pin').slice(0, PINS_MAX).flatMap((text) => parsePin(text) ?? []),
+    beside: beside === null ? null : { scan: beside, ...view('beside-') },
   };
+}
+
+const parseId = (text: string | null): string | null => (text && /^[\w-]{1,200}$/.test(text) ? text : null);
+
+function formatCamera({ azimuth, elevation, distance, target }: CameraPlace): string {
+  return [azimuth.toFixed(4), elevation.toFixed(4), ...[distance, ...target].map((mm) => mm.toFixed(2))].join(',');
 }
 
 function parseCamera(text: string | null): CameraPlace | null {

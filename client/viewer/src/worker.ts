@@ -5,10 +5,11 @@ import type { FromWorker, ToWorker } from './link.ts';
 import { decodeJpegNatively } from './jpeg_native.ts';
 import { Codecs } from './protocol/codec.ts';
 import { Htj2kDecoder } from './protocol/codec_htj2k.ts';
-import { Model } from './protocol/model.ts';
+import type { Model } from './protocol/model.ts';
 import type { ScanInfo } from './protocol/messages.ts';
-import { parseRefinement } from './protocol/refinement.ts';
+import { modelOf } from './recording.ts';
 import { Stream } from './stream.ts';
+import { tellAll } from './telling.ts';
 import { drawThumbnail, THUMBNAIL_SIDE } from './thumbnail.ts';
 import { strings } from './strings.ts';
 import { FACING_RAD } from './facing.ts';
@@ -20,10 +21,10 @@ interface Scope {
 }
 const scope = globalThis as unknown as Scope;
 
-// Asked for at once, so that it comes beside the first view.
-const htj2k = Htj2kDecoder.load(new URL(wasmPath, scope.location.href).href);
-htj2k.catch(() => undefined); // whoever awaits it hears of it
+let htj2k: Promise<Htj2kDecoder>;
 const codecs = new Codecs(() => htj2k, decodeJpegNatively);
+/** In an offline copy, all that there is. */
+let copied: Model | null = null;
 
 let stream: Stream | null = null;
 let origin = '';
@@ -40,6 +41,7 @@ function tell(said: FromWorker, transfer?: Transferable[]): void {
 scope.onmessage = ({ data: said }) => {
   switch (said.kind) {
     case 'start':
+      load(new URL(wasmPath, scope.location.href).href); // at once, so that it comes beside the first view
       origin = said.origin;
       stream = new Stream(`${origin.replace(/^http/, 'ws')}/v1/stream`, codecs, tell, explain);
       if (said.scan) stream.open(said.scan);
@@ -56,6 +58,14 @@ scope.onmessage = ({ data: said }) => {
       break;
     case 'restore':
       stream?.restore();
+      if (copied) restoreCopy(copied);
+      break;
+    case 'record':
+      stream?.record();
+      break;
+    case 'replay':
+      load(said.wasm);
+      void replay(said.info, said.refinements);
       break;
     case 'retry':
       stream?.connect();
@@ -65,6 +75,27 @@ scope.onmessage = ({ data: said }) => {
       break;
   }
 };
+
+function load(wasm: ArrayBuffer | string): void {
+  htj2k = Htj2kDecoder.load(wasm);
+  htj2k.catch(() => undefined); // whoever awaits it hears of it
+}
+
+/** Show what was recorded of a scan. */
+async function replay(info: ScanInfo, refinements: Uint8Array): Promise<void> {
+  try {
+    copied = await modelOf(info, refinements, codecs);
+    tellAll(copied, true, tell);
+  } catch (error) {
+    console.error(error);
+    tell({ kind: 'broken' });
+  }
+}
+
+function restoreCopy(model: Model): void {
+  tellAll(model, false, tell);
+  tell({ kind: 'restored' });
+}
 
 /** A browser does not say why a WebSocket failed; the node's other end does. */
 async function explain(): Promise<string> {
@@ -91,13 +122,7 @@ async function thumbnail(scan: string): Promise<void> {
 async function pictured(scan: string): Promise<Blob | null> {
   const [info, coarse] = await Promise.all([fetch(`${origin}/v1/scans/${scan}`), fetch(`${origin}/v1/scans/${scan}/coarse`)]);
   if (!info.ok || !coarse.ok) return null;
-  const model = new Model((await info.json()) as ScanInfo, 0);
-  const body = await coarse.arrayBuffer();
-  for (let at = 0; at < body.byteLength; ) {
-    const size = new DataView(body).getUint32(at, true);
-    await model.apply(parseRefinement(new Uint8Array(body, at + 4, size)), codecs);
-    at += 4 + size;
-  }
+  const model = await modelOf((await info.json()) as ScanInfo, new Uint8Array(await coarse.arrayBuffer()), codecs);
   const canvas = new OffscreenCanvas(THUMBNAIL_SIDE, THUMBNAIL_SIDE);
   const pixels = drawThumbnail(model.info, model.coarseSteps, model.coarseTexels, FACING_RAD);
   canvas.getContext('2d', { willReadFrequently: true })!.putImageData(new ImageData(pixels, THUMBNAIL_SIDE), 0, 0);

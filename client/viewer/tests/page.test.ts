@@ -2,13 +2,16 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 import { PerspectiveCamera, Ray, Vector3 } from 'three';
 import { backoffMs } from '../src/backoff.ts';
+import { inParts } from '../src/telling.ts';
 import { formatState, parseState } from '../src/url_state.ts';
 import { evened } from '../src/view/coarse_colours.ts';
 import { boundsOf, fittingDistance } from '../src/view/framing.ts';
+import { shortestPath } from '../src/view/path.ts';
 import { locate, pick } from '../src/view/pick.ts';
 import { joined, partOf, within } from '../src/view/repaint.ts';
 import type { Part } from '../src/view/repaint.ts';
 import { pointAt } from '../src/view/room.ts';
+import { shrink } from '../src/view/shrink.ts';
 import { STRIDES, Tiles } from '../src/view/tiles.ts';
 import type { Batch, Detail } from '../src/view/tiles.ts';
 
@@ -38,10 +41,11 @@ test('an address holds a view, and nonsense in it is left out', () => {
   const state = {
     scan: 'ab12', camera: { azimuth: 1, elevation: -0.5, distance: 300, target: [1, 2, 3] as [number, number, number] },
     foveae: [{ u: 0.25, v: 0.5 }], pins: [{ u: 0, v: 0.125, label: 'a, b & <c>' }],
+    beside: { scan: 'cd34', camera: { azimuth: 2, elevation: 0.25, distance: 200, target: [0, 5, 0] as [number, number, number] }, foveae: [] },
   };
   assert.deepEqual(parseState(formatState(state)), state);
-  const nothing = { scan: null, camera: null, foveae: [], pins: [] };
-  for (const text of ['', 'scan=../x', 'camera=1,2,3', 'camera=0,0,-1,0,0,0', 'fovea=2,0', 'fovea=x', 'pin=1,1,a']) {
+  const nothing = { scan: null, camera: null, foveae: [], pins: [], beside: null };
+  for (const text of ['', 'scan=../x', 'camera=1,2,3', 'camera=0,0,-1,0,0,0', 'fovea=2,0', 'fovea=x', 'pin=1,1,a', 'beside=../x']) {
     assert.deepEqual(parseState(text), nothing, text);
   }
 });
@@ -93,6 +97,39 @@ test('across a pole, and across the seam, nothing jumps', () => {
   assert.ok(before!.distanceTo(after!) < 0.01);
   const [left, right] = along([{ u: 1 - 1e-6, v: 0.4 }, { u: 1e-6, v: 0.4 }]);
   assert.ok(left!.distanceTo(right!) < 0.01);
+});
+
+test('the way over a cylinder is a helix, over the seam too, and bridges what was not measured', () => {
+  const steps = alike(50);
+  for (const [from, to] of [[{ u: 0.1, v: 0.3 }, { u: 0.3, v: 0.5 }], [{ u: 0.95, v: 0.7 }, { u: 0.1, v: 0.2 }]] as const) {
+    const turn = Math.min(Math.abs(to.u - from.u), 1 - Math.abs(to.u - from.u));
+    const helixMm = Math.hypot(2 * Math.PI * 50 * turn, (to.v - from.v) * 200);
+    const path = shortestPath(INFO, steps, from, to)!;
+    assert.ok(Math.abs(path.lengthMm / helixMm - 1) < 1e-3, `${path.lengthMm} ${helixMm}`);
+    assert.equal(path.gapsMm, 0);
+  }
+  for (let row = 60; row < 140; row++) steps.fill(0, row * INFO.width + 60, row * INFO.width + 80);
+  const over = shortestPath(INFO, steps, { u: 0.15, v: 0.5 }, { u: 0.25, v: 0.5 })!;
+  const chordMm = 2 * 50 * Math.sin(Math.PI / 18);
+  assert.ok(Math.abs(over.gapsMm - chordMm) < 1.5, `${over.gapsMm} ${chordMm}`);
+  assert.equal(shortestPath(INFO, steps, { u: 70 / 360, v: 0.5 }, { u: 0.5, v: 0.5 }), null);
+});
+
+test('the way over a ball is a great circle, wherever its centre, poles and seam lie', () => {
+  // A ball of 50 mm whose centre lies 20 mm off the grid's.
+  const offset = new Vector3(12, -10, 12.5);
+  const steps = alike(0).map((_, at) => {
+    const out = pointAt(SPHERE, { u: ((at % 360) + 0.5) / 360, v: (Math.floor(at / 360) + 0.5) / 200 }, 1).setY(Math.cos((Math.PI * (Math.floor(at / 360) + 0.5)) / 200));
+    const along = out.dot(offset);
+    return Math.round((along + Math.sqrt(along * along - offset.lengthSq() + 2500)) / INFO.stepMm);
+  });
+  const centre = offset.clone().add(new Vector3(0, SPHERE.zMaxMm, 0));
+  for (const [from, to] of [[{ u: 0.1, v: 0.3 }, { u: 0.3, v: 0.6 }], [{ u: 0.9, v: 0.45 }, { u: 0.15, v: 0.2 }], [{ u: 0.1, v: 0.08 }, { u: 0.55, v: 0.1 }]] as const) {
+    const [a, b] = [from, to].map((place) => locate(SPHERE, steps, place)!.sub(centre));
+    const arcMm = 50 * a!.angleTo(b!);
+    const path = shortestPath(SPHERE, steps, from, to)!;
+    assert.ok(Math.abs(path.lengthMm / arcMm - 1) < 2e-3, `${path.lengthMm} ${arcMm}`);
+  }
 });
 
 test('a sphere is closed over its poles by a fan for each tile beside them', () => {
@@ -192,3 +229,29 @@ function border(stride: number, edge: number): number[] {
   const rows = Array.from({ length: TILE / stride + 1 }, (_, k) => k * stride - ((k * stride) % edge));
   return [...new Set(rows)];
 }
+
+test('shrunk colour is the mean of what is there, wherever its rectangle begins', () => {
+  const grey = (values: number[]) => Uint8Array.from(values.flatMap((value) => (value ? [value, value, value, 255] : [0, 0, 0, 0])));
+  const texels = { x: 3, y: 2, width: 3, height: 2, cells: grey([10, 20, 40, 30, 0, 60]) };
+  assert.equal(shrink(texels, [1, 1]), texels);
+  assert.deepEqual(shrink(texels, [2, 1]), { x: 1, y: 2, width: 2, height: 2, cells: grey([10, 30, 30, 60]) });
+  assert.deepEqual(shrink(texels, [2, 2]), { x: 1, y: 1, width: 2, height: 1, cells: grey([20, 40]) });
+});
+
+test('a large change is told in parts, which are the same together', () => {
+  const [width, height] = [1000, 1200];
+  const cells = Uint16Array.from({ length: width * height }, (_, at) => at % 65521);
+  const small = { x: 1, y: 2, width: 2, height: 1, cells: Uint8Array.of(1, 2, 3, 4, 5, 6, 7, 8) };
+  const parts = inParts([{ x: 7, y: 100, width, height, cells }, small]);
+  assert.ok(parts.length > 2 && parts.every((part) => part.reduce((sum, one) => sum + one.width * one.height, 0) <= 1 << 19));
+  const told = parts.flat();
+  assert.deepEqual(told.at(-1), small);
+  let row = 100;
+  for (const one of told.slice(0, -1)) {
+    assert.deepEqual([one.x, one.y, one.width], [7, row, width]);
+    assert.deepEqual(one.cells, cells.slice((row - 100) * width, (row - 100 + one.height) * width));
+    row += one.height;
+  }
+  assert.equal(row, 100 + height);
+  assert.deepEqual(inParts([small, small]), [[small, small]]);
+});

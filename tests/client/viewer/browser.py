@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, Playwright
+
+import hatch_build
 
 CHROMIUM = "/usr/bin/chromium"
 # Software rendering, so that every machine draws alike; and no calls home.
@@ -19,6 +22,8 @@ ARGUMENTS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 WAIT_MS = 20_000
+AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
+FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
 Picture = NDArray[np.float64]
 
 
@@ -72,20 +77,33 @@ def wait_updates(page: Page, count: int) -> None:
     wait_drawn(page)
 
 
-def click(page: Page, x: float, y: float) -> None:
+def click(page: Page, x: float, y: float, view: str = "#view") -> None:
     """Click the picture at shares of its width and height."""
-    box = page.locator("#view").bounding_box()
+    box = page.locator(view).bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
 
 
-def crop(page: Page, x: float, y: float, side: int) -> Picture:
+def crop(page: Page, x: float, y: float, side: int, view: str = "#view") -> Picture:
     """What is drawn round a place of the picture: (side, side, 3) 0..255."""
-    box = page.locator("#view").bounding_box()
+    box = page.locator(view).bounding_box()
     assert box is not None
     left, top = box["x"] + x * box["width"] - side / 2, box["y"] + y * box["height"] - side / 2
     png = page.screenshot(clip={"x": left, "y": top, "width": side, "height": side})
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), np.float64)
+
+
+def barriers(page: Page) -> list[tuple[str, list[str]]]:
+    """What axe-core finds on a page as it stands: rules that are broken, and the elements that do."""
+    page.evaluate(AXE.read_text())
+    found = page.evaluate("() => axe.run()")
+    return [(problem["id"], [one["html"] for one in problem["nodes"]]) for problem in found["violations"]]
+
+
+def layout_faults(page: Page) -> list[str]:
+    """Texts that are cut, and controls that lie on each other, on a page as it stands."""
+    found: list[str] = page.evaluate(FAULTS)
+    return found
 
 
 def psnr(one: Picture, other: Picture) -> float:

@@ -25,7 +25,7 @@
       const [a, b] = [one.getBoundingClientRect(), other.getBoundingClientRect()];
       const across = Math.min(a.right, b.right) - Math.max(a.left, b.left);
       const down = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
-      const sameScroller = one.closest('#panel') === other.closest('#panel');
+      const sameScroller = one.closest('.scans, #panel') === other.closest('.scans, #panel');
       if (across > 1 && down > 1 && sameScroller) faults.push(`${name(one)} lies on ${name(other)}`);
     }
   }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import json
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -39,8 +40,10 @@ def main() -> None:
         node = aside.submit(run_line, stack, folder, "--specimen", "head", *SPECIMEN).result()
         _looks(browser, node)
         _tools(browser, node)
+        _path(browser, node)
         _narrow(browser, node)
         _sweep(browser, node)
+        _compare(browser, node, aside)
         _pole(browser, stack.enter_context(_pebble(aside, folder / "closed")))
 
 
@@ -109,6 +112,55 @@ def _sweep(browser: Browser, node: RunningNode) -> None:
         wait_drawn(page)
         _take(page, "sweep")
         page.wait_for_selector('html[data-live="no"]', state="attached")
+
+
+def _path(browser: Browser, node: RunningNode) -> None:
+    """A path of several points over the cheek, then the offline copy of that view."""
+    with opened(browser, node.url, viewport=WIDE) as page:
+        page.locator("#view").focus()
+        for key in ("ArrowRight", "ArrowRight", "ArrowRight", *"++++", "Enter"):
+            page.keyboard.press(key)
+        wait_updates(page, 1)
+        page.get_by_label("traces a path").check()
+        for place in ((0.45, 0.3), (0.55, 0.42), (0.52, 0.6), (0.4, 0.72)):
+            click(page, *place)
+        _take(page, "path")
+        page.locator("summary:has-text('This scan')").click()
+        page.get_by_role("button", name="Offline copy of this view").click()
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Save the file").click()
+        with tempfile.NamedTemporaryFile(suffix=".html") as copy:
+            download.value.save_as(copy.name)
+            at, look = f"file://{copy.name}", {"viewport": WIDE, "color_scheme": "dark"}
+            with opened(browser, at, allowed=copy.name, **look) as offline:
+                _take(offline, "offline_copy")
+
+
+def _compare(browser: Browser, node: RunningNode, aside: Executor) -> None:
+    """Two visits of one subject, the same place sharp in both."""
+    file = io.BytesIO()
+    write_native(GENERATORS["head"]((1440, 1024, 4096, 2048), 2), file, "Six weeks later")
+    file.seek(0)
+    sent = send_scan(node.url, file, moved=lambda done, total: None)
+    later = aside.submit(asyncio.run, sent).result().scan
+    with opened(browser, node.url, viewport=WIDE) as page:
+        scans = page.request.get(f"{node.url}/v1/scans").json()
+        first = next(scan["id"] for scan in scans if scan["id"] != later)
+        for scan, name in ((first, "First visit"), (later, "Six weeks later")):
+            said = json.dumps({"name": name, "subject": "P-17", "body_site": "face"})
+            json_headers = {"Content-Type": "application/json"}
+            page.request.patch(f"{node.url}/v1/scans/{scan}/sidecar", data=said, headers=json_headers)
+    with opened(browser, f"{node.url}/#scan={first}", viewport=WIDE) as page:
+        page.locator("summary:has-text('Compare')").click()
+        page.get_by_label("Beside the open scan").select_option(later)
+        page.wait_for_selector(f'.picture[data-scan="{later}"]')
+        page.locator("#view").focus()
+        for key in ("ArrowRight", "ArrowRight", *"+++", "Enter"):
+            page.keyboard.press(key)
+        wait_updates(page, 1)
+        page.wait_for_selector('.picture[data-updates="1"][data-looking="no"]')
+        page.get_by_label("Sharpen both").scroll_into_view_if_needed()
+        _take(page, "compare")
 
 
 def _pole(browser: Browser, url: str) -> None:

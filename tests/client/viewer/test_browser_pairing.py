@@ -11,6 +11,7 @@ from playwright.sync_api import sync_playwright
 
 from foveascan import PROGRAM, started
 from node.library import About, Library
+from node.sidecar import Changes, Pin
 from tests.client.viewer.browser import blank, launch, wait_drawn
 from tests.node.scans import make_grid
 
@@ -23,7 +24,8 @@ def run(*arguments: str) -> dict[str, str]:
 
 def keep_a_scan(folder: Path) -> None:
     library = Library(folder)
-    library.add(make_grid(160, 96), About(0.0))
+    scan = library.add(make_grid(160, 96), About(0.0))
+    library.annotate(scan.id, Changes(pins=(Pin(0.5, 0.5, "mole"),)), by="test")
     library.close()
 
 
@@ -49,6 +51,9 @@ def test_a_browser_is_let_in_by_a_code_and_put_out_again(tmp_path: Path) -> None
             for what in ("Start a sweep", "Save", "Delete the scan", "sets a pin"):
                 found = page.locator("button, label").get_by_text(what).all()
                 assert found and not any(one.is_visible() for one in found), f"who may only look is offered: {what}"
+            assert page.locator(".pin").get_by_text("mole").is_visible()
+            assert page.get_by_role("button", name="Show pin mole").is_visible()
+            assert page.get_by_role("button", name="Remove pin mole").count() == 0
             assert page.get_by_text("To sweep, to set pins, to name or delete scans").first.is_visible()
             run("access", "revoke", "tablet", "--library", str(tmp_path))
             page.goto(f"{ready['url']}/")

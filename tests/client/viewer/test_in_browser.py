@@ -81,7 +81,7 @@ def test_distances_are_true_within_one_percent(browser: Browser, node: RunningNo
         click(page, 0.46, 0.5)
         click(page, 0.55, 0.45)
         output = page.locator("output.distance")
-        shown_mm = float((output.text_content() or "").removesuffix(" mm"))
+        shown_mm = float((output.locator("strong").text_content() or "").removesuffix(" mm"))
         places = [tuple(map(float, place.split(","))) for place in (output.get_attribute("data-places") or "").split()]
     assert shown_mm == pytest.approx(math.dist(*(point(node, *place) for place in places)), rel=0.01)
     assert shown_mm > 20
@@ -161,6 +161,23 @@ def test_detail_follows_the_pointer(browser: Browser, node: RunningNode) -> None
         page.mouse.move(box["x"] + 0.48 * box["width"], box["y"] + 0.5 * box["height"])
         page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
         wait_updates(page, 1)
+
+
+def test_what_is_coming_can_be_stopped(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        before = received(page)
+        exactly(page)
+        page.get_by_label("Area round the click").select_option("1")
+        page.locator("#view").focus()
+        page.keyboard.press("Enter")
+        page.keyboard.press("Escape")
+        page.wait_for_selector('html[data-looking="no"]', state="attached")
+        assert page.evaluate("document.documentElement.dataset.updates") is None
+        page.get_by_label("Quality", exact=True).select_option("preview")
+        page.get_by_label("Area round the click").select_option("0.02")
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        assert received(page) - before < 500_000, "all of it came"
 
 
 def test_downloads_are_whole_files(browser: Browser, node: RunningNode) -> None:

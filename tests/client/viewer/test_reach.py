@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page
 
-import hatch_build
-from tests.client.viewer.browser import crop, opened, psnr, wait_drawn, wait_updates
+from tests.client.viewer.browser import barriers, crop, layout_faults, opened, psnr, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
-
-AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
-FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +73,7 @@ def test_everything_can_be_done_by_keyboard(browser: Browser, node: RunningNode)
 def test_axe_finds_nothing(browser: Browser, node: RunningNode, scheme: str, width: int) -> None:
     with opened(browser, node.url, color_scheme=scheme, viewport={"width": width, "height": 800}) as page:
         unfold(page)
-        page.evaluate(AXE.read_text())
-        found = page.evaluate("() => axe.run()")
-        assert [(problem["id"], [one["html"] for one in problem["nodes"]]) for problem in found["violations"]] == []
+        assert barriers(page) == []
 
 
 @pytest.mark.parametrize(
@@ -95,7 +88,7 @@ def test_nothing_is_cut_and_nothing_lies_on_anything(
         page.evaluate("(size) => { document.documentElement.style.fontSize = size; }", letters)
         unfold(page)
         wait_drawn(page)
-        assert not (faults := page.evaluate(FAULTS)), faults
+        assert layout_faults(page) == []
         for name in ("Sharpen the middle", "Copy a link"):
             button = page.get_by_role("button", name=name)
             button.scroll_into_view_if_needed()

@@ -2,6 +2,7 @@ import { downloadPath } from '../api.ts';
 import type { Changes, Sidecar } from '../api.ts';
 import type { ScanInfo } from '../protocol/messages.ts';
 import { strings } from '../strings.ts';
+import { CopyDialog } from './copy_dialog.ts';
 import { h, refill, section } from './dom.ts';
 
 /** The scan that is open: its name and place, downloads, deletion. */
@@ -16,7 +17,7 @@ export class AboutPanel {
   private readonly mayNot = h('p', { class: 'quiet', hidden: true }, strings.role);
   private readonly copied = h('p', { class: 'quiet', role: 'status' });
 
-  constructor(save: (changes: Changes) => void, remove: () => void) {
+  constructor(save: (changes: Changes) => void, remove: () => void, makeCopy: (named: boolean) => void) {
     const { about } = strings;
     this.inputs = { name: text(200), subject: text(64), body_site: text(100) };
     const submit = (event: Event) => {
@@ -37,8 +38,9 @@ export class AboutPanel {
         h('button', { type: 'button', class: 'danger', click: yes }, about.yes))));
     this.remove = h('button', { type: 'button', class: 'secondary', click: () => this.dialog.showModal() }, about.remove);
     const copy = h('button', { type: 'button', class: 'secondary', click: () => void this.copy() }, about.copy);
+    const offline = new CopyDialog(makeCopy);
     this.element = section(about.heading, false, this.samples, this.form, this.mayNot,
-      h('p', { class: 'label' }, about.download), this.downloads, copy, this.copied, this.remove, this.dialog);
+      h('p', { class: 'label' }, about.download), this.downloads, offline.button, copy, this.copied, this.remove, this.dialog, offline.element);
     this.element.hidden = true;
   }
 

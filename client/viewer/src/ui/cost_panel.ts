@@ -34,9 +34,10 @@ export class CostPanel {
     new ResizeObserver(() => this.resize()).observe(this.charts[0]);
   }
 
-  traffic(received: number): void {
-    this.total = received;
-    this.received.textContent = strings.bytes(received);
+  /** So many bytes more have come. */
+  traffic(bytes: number): void {
+    this.total += bytes;
+    this.received.textContent = strings.bytes(this.total);
   }
 
   answered({ bytes, elapsedMs, reason, textureDb, errorMaxMm }: Answer): void {

@@ -10,25 +10,23 @@ const OVERLAYS: Record<string, Channel | null> = { none: null, range: RANGE, tex
 export class DisplayPanel {
   readonly element: HTMLElement;
   readonly legend: HTMLElement;
-  private shading: Shading = 'lit';
-  private overlay: Channel | null = null;
 
-  constructor(changed: (shading: Shading, overlay: Channel | null) => void) {
+  constructor(changed: () => void, public shading: Shading = 'lit', public overlay: Channel | null = null) {
     const { show } = strings;
     const tell = () => {
       this.legend.hidden = this.overlay === null;
-      changed(this.shading, this.overlay);
+      changed();
     };
     const scale = h('span', { class: 'scale', 'aria-hidden': 'true' });
-    this.legend = h('figure', { class: 'legend', hidden: true }, scale,
+    this.legend = h('figure', { class: 'legend', hidden: overlay === null }, scale,
       h('span', { class: 'ticks', 'aria-hidden': 'true' }, ...['1', '2', '4', '8+'].map((tick) => h('span', {}, tick))),
       h('figcaption', {}, show.legend));
     this.element = section(show.heading, false,
-      choice(show.shading, show.shadings, 'lit', (value) => {
+      choice(show.shading, show.shadings, shading, (value) => {
         this.shading = value as Shading;
         tell();
       }),
-      choice(show.overlay, show.overlays, 'none', (value) => {
+      choice(show.overlay, show.overlays, Object.keys(OVERLAYS).find((name) => OVERLAYS[name] === overlay)!, (value) => {
         this.overlay = OVERLAYS[value] ?? null;
         tell();
       }),

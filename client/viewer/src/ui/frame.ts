@@ -1,6 +1,6 @@
 import type { LinkState } from '../link.ts';
 import { strings } from '../strings.ts';
-import { h } from './dom.ts';
+import { h, refill } from './dom.ts';
 
 const NOTICE_MS = 6000;
 
@@ -15,6 +15,7 @@ export class Frame {
   readonly stage: HTMLElement;
   /** Where the pictures stand beside each other. */
   readonly pictures = h('div', { id: 'pictures' });
+  private readonly captions = h('div', { id: 'captions', hidden: true });
   private readonly link = h('p', { id: 'link', role: 'status' }, strings.link.connecting);
   private readonly retry: HTMLButtonElement;
   private readonly notice = h('p', { id: 'notice', role: 'status' });
@@ -31,17 +32,31 @@ export class Frame {
       button('+', strings.view.zoomIn, () => actions.zoom(1)), button('−', strings.view.zoomOut, () => actions.zoom(-1)),
       button('⌂', strings.view.home, () => actions.home()));
     this.retry = h('button', { type: 'button', class: 'secondary', hidden: true, click: () => actions.retry() }, strings.link.again);
-    this.stage = h('section', { id: 'stage', 'aria-label': strings.view.label.split('.')[0]! },
-      this.pictures, this.empty, this.notice, this.hint, zoom);
+    this.stage = h('div', { id: 'stage' }, this.pictures, this.empty, this.notice, this.hint, zoom);
     root.append(
       h('header', {}, h('h1', {}, strings.title), h('div', {}, this.link, this.retry)),
-      h('main', {}, this.stage, this.panel),
+      h('main', {}, h('section', { id: 'views', 'aria-label': strings.view.label.split('.')[0]! }, this.captions, this.stage), this.panel),
     );
   }
 
   /** Put panels beside the picture. */
   add(...panels: HTMLElement[]): void {
     this.panel.append(...panels);
+  }
+
+  /** There is no connection, and never will be: what stands in its place. */
+  offline(text: string): void {
+    this.link.textContent = text;
+    document.documentElement.dataset['link'] = 'none';
+  }
+
+  /** What the pictures beside each other show; nothing is written over a single one. */
+  caption(open: string, beside: string | null, close: () => void): void {
+    this.captions.hidden = beside === null;
+    if (beside === null) return this.captions.replaceChildren();
+    const { compare } = strings;
+    const button = h('button', { type: 'button', class: 'secondary', 'aria-label': compare.close, title: compare.close, click: close }, '×');
+    refill(this.captions, h('p', {}, open), h('p', {}, beside), button);
   }
 
   /** Say something for a few seconds. */

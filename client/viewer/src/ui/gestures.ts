@@ -18,6 +18,10 @@ export interface Meanings {
   home(): void;
   /** What a click does, in the middle of the picture. */
   act(): void;
+  /** Take the last point back. */
+  undo(): void;
+  /** What is on its way is not wanted any more. */
+  cancel(): void;
 }
 
 /** Hear what people do on the picture. */
@@ -48,6 +52,8 @@ function keyed({ key, shiftKey }: KeyboardEvent, to: Meanings): boolean {
   else if (key === '-') to.zoom(-1);
   else if (key === 'Home') to.home();
   else if (key === 'Enter') to.act();
+  else if (key === 'Backspace') to.undo();
+  else if (key === 'Escape') to.cancel();
   else return false;
   return true;
 }

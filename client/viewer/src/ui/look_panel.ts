@@ -1,8 +1,9 @@
 import type { LookOptions } from '../link.ts';
 import { strings } from '../strings.ts';
 import { choice, h, section } from './dom.ts';
+import { ToolChoice } from './tool_choice.ts';
+import type { Tool } from './tool_choice.ts';
 
-export type Tool = 'sharpen' | 'measure' | 'pin';
 const QUALITIES: Record<string, Pick<LookOptions, 'textureDb' | 'rangeMm'>> = {
   preview: { textureDb: 34, rangeMm: 0.3 },
   fine: { textureDb: 40, rangeMm: 0.1 },
@@ -12,22 +13,16 @@ const QUALITIES: Record<string, Pick<LookOptions, 'textureDb' | 'rangeMm'>> = {
 /** What a click does, and how sharp. */
 export class LookPanel {
   readonly element: HTMLElement;
-  tool: Tool = 'sharpen';
+  readonly tools: ToolChoice;
   follow = false;
   options: LookOptions = { window: 0.05, ...QUALITIES['fine']! };
-  private readonly radios: Record<string, HTMLInputElement> = {};
 
   constructor(sharpenMiddle: () => void, toolChanged: (tool: Tool) => void) {
     const { look } = strings;
-    const tools = Object.entries(look.tools).map(([value, text]) => {
-      const change = () => toolChanged((this.tool = value as Tool));
-      const radio = h('input', { type: 'radio', name: 'tool', value, checked: value === this.tool, change });
-      this.radios[value] = radio;
-      return h('label', {}, radio, text);
-    });
+    this.tools = new ToolChoice(['sharpen', 'measure', 'path', 'pin'], toolChanged);
     const follow = h('input', { type: 'checkbox', role: 'switch', change: () => (this.follow = follow.checked) });
     this.element = section(look.heading, true,
-      h('fieldset', { class: 'row' }, h('legend', {}, look.tool), ...tools),
+      this.tools.element,
       h('button', { type: 'button', class: 'secondary', click: sharpenMiddle }, look.here),
       h('label', {}, follow, look.follow),
       choice(look.quality, look.qualities, 'fine', (value) => Object.assign(this.options, QUALITIES[value])),
@@ -35,12 +30,6 @@ export class LookPanel {
       choice(look.falloff, look.falloffs, 'auto', (value) => this.set('alpha', value === 'auto' ? 0 : Number(value))),
       choice(look.time, look.times, '0', (value) => this.set('maxWaitS', Number(value))),
     );
-  }
-
-  /** Whether a click may set pins. */
-  allowPins(allowed: boolean): void {
-    this.radios['pin']!.parentElement!.hidden = !allowed;
-    if (!allowed && this.tool === 'pin') this.radios['sharpen']!.click();
   }
 
   private set(name: 'maxWaitS' | 'alpha', value: number): void {

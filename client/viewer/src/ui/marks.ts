@@ -1,9 +1,11 @@
-import { strings } from '../strings.ts';
 import type { Pin } from '../url_state.ts';
+import type { Path } from '../view/path.ts';
 import type { Place } from '../view/room.ts';
-import type { Stage } from '../view/stage.ts';
+import type { Sight } from '../view/sight.ts';
 import { h, refill } from './dom.ts';
 
+/** From a point to what is written over it. */
+const OVER_PX = 12;
 const SVG = 'http://www.w3.org/2000/svg';
 
 /** What lies over the picture: pins, and the line of a measurement. */
@@ -11,16 +13,20 @@ export class Marks {
   readonly element = h('div', { class: 'marks', 'aria-hidden': 'true' });
   private readonly svg = document.createElementNS(SVG, 'svg');
   private readonly line = document.createElementNS(SVG, 'line');
-  private readonly ends = [h('span', { class: 'end' }), h('span', { class: 'end' })];
+  /** Of a path along the surface, what faces us and what is turned away. */
+  private readonly ways = [document.createElementNS(SVG, 'path'), document.createElementNS(SVG, 'path')] as const;
   private readonly result = h('output', { class: 'distance' });
   private readonly busy = h('span', { class: 'busy', hidden: true });
+  private ends: { place: Place; element: HTMLElement }[] = [];
+  private legs: Path[] = [];
+  private isStraight = false;
   private pins: { pin: Pin; element: HTMLElement }[] = [];
-  private measured: Place[] = [];
   private looked: Place | null = null;
 
-  constructor(private readonly stage: Stage) {
-    this.svg.append(this.line);
-    this.element.append(this.svg, ...this.ends, this.result, this.busy);
+  constructor(private readonly sight: Sight) {
+    this.ways[1].classList.add('away');
+    this.svg.append(...this.ways, this.line);
+    this.element.append(this.svg, this.result, this.busy);
     this.update();
   }
 
@@ -31,10 +37,14 @@ export class Marks {
     this.update();
   }
 
-  setMeasured(places: Place[], distanceMm: number | null): void {
-    this.measured = places;
+  /** The points of a measurement, the ways between them, and what to write beside: straight across, along the surface. */
+  setMeasured(places: Place[], legs: Path[], straight: string | null, along: string | null): void {
+    for (const { element } of this.ends) element.remove();
+    this.ends = places.map((place) => ({ place, element: h('span', { class: 'end' }) }));
+    this.element.append(...this.ends.map(({ element }) => element));
+    [this.legs, this.isStraight] = [legs, straight !== null];
     this.result.dataset['places'] = places.map(({ u, v }) => `${u},${v}`).join(' ');
-    refill(this.result, distanceMm === null ? null : strings.measure.result(distanceMm));
+    refill(this.result, straight && h('strong', {}, straight), along && h('span', {}, along));
     this.update();
   }
 
@@ -48,17 +58,44 @@ export class Marks {
   update(): void {
     for (const { pin, element } of this.pins) this.put(element, pin);
     this.put(this.busy, this.looked);
-    const ends = this.ends.map((element, index) => this.put(element, this.measured[index] ?? null));
-    const [a, b] = ends;
-    this.line.style.display = a && b ? '' : 'none';
-    this.result.hidden = !(a && b && this.result.textContent);
+    const ends = this.ends.map(({ place, element }) => this.put(element, place));
+    this.drawWays();
+    const [a, b] = this.isStraight ? ends : [ends.at(-1), ends.at(-1)];
+    this.line.style.display = this.isStraight && a && b ? '' : 'none';
+    this.result.hidden = !(a && b && this.legs.length);
     if (!a || !b) return;
     for (const [name, value] of [['x1', a.x], ['y1', a.y], ['x2', b.x], ['y2', b.y]] as const) this.line.setAttribute(name, value.toFixed(1));
-    this.result.style.transform = `translate(${(a.x + b.x) / 2}px, ${(a.y + b.y) / 2}px) translate(-50%, -140%)`;
+    const { x, y } = this.inside((a.x + b.x) / 2, Math.min(a.y, b.y));
+    this.result.style.transform = `translate(${x}px, ${y}px)`;
+  }
+
+  /** Where the result stands so that it is over a point, but nowhere cut. */
+  private inside(x: number, y: number): { x: number; y: number } {
+    const { offsetWidth: width, offsetHeight: height } = this.result;
+    const { clientWidth: widest, clientHeight: highest } = this.element;
+    return {
+      x: Math.min(Math.max(x - width / 2, 0), Math.max(widest - width, 0)),
+      y: Math.min(Math.max(y - height - OVER_PX, 0), Math.max(highest - height, 0)),
+    };
+  }
+
+  private drawWays(): void {
+    const drawn = ['', ''];
+    for (const { points, normals } of this.legs) {
+      let before = -1;
+      points.forEach((point, at) => {
+        const { x, y, away } = this.sight.sketch(point, normals[at]!);
+        const here = `${x.toFixed(1)} ${y.toFixed(1)}`;
+        if (before >= 0) drawn[before] += `L${here}`;
+        if (before !== Number(away)) drawn[Number(away)] += `M${here}`;
+        before = Number(away);
+      });
+    }
+    this.ways.forEach((way, at) => way.setAttribute('d', drawn[at]!));
   }
 
   private put(element: HTMLElement, place: Place | null): { x: number; y: number } | null {
-    const at = place && this.stage.project(place);
+    const at = place && this.sight.project(place);
     element.hidden = !at;
     if (!at) return null;
     element.style.transform = `translate(${at.x}px, ${at.y}px)`;

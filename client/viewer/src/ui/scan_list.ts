@@ -10,7 +10,7 @@ export class ScanList {
   private readonly pictures = new Map<string, string>();
   private readonly images = new Map<string, HTMLImageElement>();
   private readonly inView = new IntersectionObserver((entries) => this.seen(entries));
-  private scans: ScanSummary[] = [];
+  scans: ScanSummary[] = [];
   private current: string | null = null;
 
   constructor(private readonly open: (id: string) => void, private readonly wantPicture: (id: string) => void) {
@@ -68,7 +68,7 @@ export class ScanList {
     const text = h('span', {},
       h('strong', {}, scan.name || strings.scans.untitled),
       site ? h('span', {}, site) : null,
-      h('small', {}, h('time', { datetime: new Date(1000 * scan.created).toISOString() }, when(scan.created))),
+      h('small', {}, h('time', { datetime: new Date(1000 * scan.created).toISOString() }, strings.scans.when(scan.created))),
     );
     const current = scan.id === this.current;
     const attributes = { type: 'button', 'data-scan': scan.id, 'aria-current': current ? 'true' : null, click: () => this.open(scan.id) };
@@ -76,8 +76,4 @@ export class ScanList {
     this.inView.observe(button);
     return h('li', {}, button);
   }
-}
-
-function when(unixS: number): string {
-  return new Date(1000 * unixS).toLocaleString(undefined, { dateStyle: 'medium', timeStyle: 'short' });
 }

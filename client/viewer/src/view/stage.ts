@@ -1,6 +1,6 @@
 // The picture: renderer, camera and controls, one surface; drawn only when something has changed.
 
-import { PerspectiveCamera, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from 'three';
+import { PerspectiveCamera, Scene, Vector3, WebGLRenderer } from 'three';
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
 import type { Snapshot } from '../link.ts';
 import type { Channel } from '../protocol/lattice.ts';
@@ -8,11 +8,11 @@ import type { Changed } from '../protocol/model.ts';
 import { FACING_RAD } from '../facing.ts';
 import { cardIsDone } from './compile.ts';
 import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
-import { locate, pick } from './pick.ts';
 import { geometryOf, isSphere } from './room.ts';
 import type { Geometry, Place } from './room.ts';
 import { within as inside, joined } from './repaint.ts';
 import type { Part } from './repaint.ts';
+import { Sight } from './sight.ts';
 import { Surface } from './surface.ts';
 import type { Shading } from './surface.ts';
 import type { Detail } from './tiles.ts';
@@ -41,6 +41,8 @@ export interface CameraPlace {
 export interface StageEvents {
   /** A picture was drawn: marks on it must move along. */
   drawn(): void;
+  /** The camera has moved, or starts or ends to. */
+  moved(): void;
   /** The camera has come to rest. */
   settled(): void;
   /** Graphics memory was lost, and is there again: everything must be shown anew. */
@@ -55,6 +57,8 @@ export class Stage {
   private readonly scene = new Scene();
   private readonly camera = new PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 1, 1000);
   private readonly controls: OrbitControls;
+  /** What lies under which point of the picture. */
+  readonly sight: Sight;
   private surface: Surface | null = null;
   /**
    * The smallest surface of each kind, once its programs are compiled; while it is kept, so are they. Until then nothing
@@ -67,7 +71,10 @@ export class Stage {
   private asked = false;
   /** What is to be drawn anew. */
   private due: Part | 'all' | null = 'all';
-  private moving = false;
+  /** Whether the camera is being moved by hand. */
+  moving = false;
+  /** Nobody has moved the camera since it was put where it sees everything. */
+  private isFramed = false;
   private pace = 1;
   /** The last picture was drawn more coarsely than could be, to keep up. */
   private isHasty = false;
@@ -85,8 +92,12 @@ export class Stage {
     this.detail = this.software ? SOFTWARE : HARDWARE;
     this.renderer.setClearColor(0, 0);
     this.controls = new OrbitControls(this.camera, canvas);
+    this.sight = new Sight(canvas, this.camera, () => this.surface);
     Object.assign(this.controls, { enableDamping: !calm, dampingFactor: 0.12, zoomToCursor: true, rotateSpeed: 0.7 });
-    this.controls.addEventListener('change', () => this.draw());
+    this.controls.addEventListener('change', () => {
+      this.draw();
+      this.events.moved();
+    });
     this.controls.addEventListener('start', () => this.move(true));
     this.controls.addEventListener('end', () => this.move(false));
     canvas.addEventListener('webglcontextlost', (event) => {
@@ -155,9 +166,9 @@ export class Stage {
     this.draw();
   }
 
-  /** How many texels stand for one, each way, because the graphics card takes no larger texture; 1 is all. */
+  /** How many texels stand for one, because the graphics card takes no larger texture; 1 is all. */
   get shrunk(): number {
-    return this.surface?.shrunk ?? 1;
+    return Math.max(...(this.surface?.shrunk ?? [1]));
   }
 
   /** Put the camera where it sees the whole scan from the front. */
@@ -168,6 +179,7 @@ export class Stage {
     this.place({
       azimuth: FACING_RAD, elevation: 0.1, distance: fittingDistance(bounds, this.camera.aspect), target: [0, middle, 0],
     });
+    this.isFramed = true;
   }
 
   /** Put the camera where a sweep to come will fit, of which only the geometry is known. */
@@ -181,11 +193,18 @@ export class Stage {
 
   place({ azimuth, elevation, distance, target }: CameraPlace): void {
     const flat = Math.cos(elevation) * distance;
+    this.isFramed = false;
     this.controls.target.set(...target);
     this.camera.position.set(flat * Math.cos(azimuth), Math.sin(elevation) * distance, -flat * Math.sin(azimuth));
     this.camera.position.add(this.controls.target);
     this.controls.update();
     this.draw();
+  }
+
+  /** Stand where another camera leads, as coarse as it takes to keep up while that moves. */
+  follow(camera: CameraPlace, moving: boolean): void {
+    this.place(camera);
+    if (this.moving !== moving) this.move(moving);
   }
 
   get placed(): CameraPlace {
@@ -228,39 +247,6 @@ export class Stage {
     const target = new Vector3(...now.target).add(across).add(along).toArray();
     this.place({ ...now, target });
     this.settle();
-  }
-
-  /** The place under a point of the page, or null. */
-  pick(clientX: number, clientY: number): Place | null {
-    if (!this.surface) return null;
-    const box = this.canvas.getBoundingClientRect();
-    const at = new Vector2(((clientX - box.left) / box.width) * 2 - 1, 1 - ((clientY - box.top) / box.height) * 2);
-    this.camera.updateMatrixWorld();
-    const caster = new Raycaster();
-    caster.setFromCamera(at, this.camera);
-    return pick(this.surface.info, this.surface.steps, caster.ray);
-  }
-
-  /** The place in the middle of the picture, or null. */
-  pickMiddle(): Place | null {
-    const box = this.canvas.getBoundingClientRect();
-    return this.pick(box.left + box.width / 2, box.top + box.height / 2);
-  }
-
-  /** Where a place is in the room [mm]; null where nothing was measured. */
-  locate(place: Place): Vector3 | null {
-    return this.surface ? locate(this.surface.info, this.surface.steps, place) : null;
-  }
-
-  /** Where a place is on the picture [CSS px], and whether the surface hides it. */
-  project(place: Place): { x: number; y: number; hidden: boolean } | null {
-    const point = this.locate(place);
-    if (!point || !this.surface) return null;
-    const [ndc, box] = [point.clone().project(this.camera), this.canvas.getBoundingClientRect()];
-    const x = ((ndc.x + 1) / 2) * box.width;
-    const y = ((1 - ndc.y) / 2) * box.height;
-    const outside = Math.abs(ndc.x) > 1 || Math.abs(ndc.y) > 1 || ndc.z > 1;
-    return { x, y, hidden: outside || this.hides(point) };
   }
 
   /** Do what the first picture could do without, so that the first look need not wait for it. */
@@ -356,7 +342,9 @@ export class Stage {
 
   private move(moving: boolean): void {
     this.moving = moving;
-    if (!moving) this.settle();
+    if (moving) this.isFramed = false;
+    else this.settle();
+    this.events.moved();
   }
 
   private settle(): void {
@@ -367,21 +355,12 @@ export class Stage {
     }, 250);
   }
 
-  private hides(point: Vector3): boolean {
-    const caster = new Raycaster();
-    const toPoint = point.clone().sub(this.camera.position);
-    const distance = toPoint.length();
-    caster.set(this.camera.position, toPoint.normalize());
-    const first = pick(this.surface!.info, this.surface!.steps, caster.ray);
-    const met = first && this.locate(first);
-    return met !== null && met.distanceTo(this.camera.position) < distance * 0.985;
-  }
-
   private resize(): void {
     const { clientWidth, clientHeight } = this.canvas.parentElement!;
     this.renderer.setPixelRatio(this.software ? 1 : Math.min(Math.max(window.devicePixelRatio, SMOOTH_RATIO), 2));
     this.renderer.setSize(Math.max(1, clientWidth), Math.max(1, clientHeight), false);
     this.camera.aspect = Math.max(1, clientWidth) / Math.max(1, clientHeight);
+    if (this.isFramed) this.frame();
     this.draw();
   }
 }

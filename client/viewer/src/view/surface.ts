@@ -18,6 +18,8 @@ import { Normals, NORMALS_REACH } from './normals.ts';
 import { joined, partOf } from './repaint.ts';
 import type { Part } from './repaint.ts';
 import { isSphere } from './room.ts';
+import type { Place } from './room.ts';
+import { shrink } from './shrink.ts';
 import { STRIDES, Tiles } from './tiles.ts';
 import type { Detail } from './tiles.ts';
 
@@ -29,8 +31,8 @@ const TEXTURE_BLOCK = 16;
 export class Surface {
   readonly object = new Group();
   readonly steps: Uint16Array;
-  /** How many texels of the scan stand for one here, each way, where the graphics card takes no larger texture. */
-  readonly shrunk: number;
+  /** How many texels of the scan stand for one here, across and down, where the graphics card takes no larger texture. */
+  readonly shrunk: readonly [across: number, down: number];
   private readonly tiles: Tiles;
   /** By stride, made when first drawn; and of a sphere, what closes it over its poles. */
   private readonly meshes: (GridMesh | undefined)[] = [];
@@ -50,7 +52,7 @@ export class Surface {
     const { width, height } = info;
     const most = renderer.capabilities.maxTextureSize;
     if (width > most || height > most) throw new RangeError(`this graphics card draws at most ${most} columns`);
-    this.shrunk = Math.ceil(Math.max(info.textureWidth, info.textureHeight) / most);
+    this.shrunk = [Math.ceil(info.textureWidth / most), Math.ceil(info.textureHeight / most)];
     this.steps = snapshot.steps;
     this.range = integers(this.steps, width, height, 'R16UI');
     this.levels = [
@@ -87,6 +89,13 @@ export class Surface {
     this.normals.fill();
     // three.js asks the card about uploads once, and waits for the answer.
     this.upload(integers(this.steps.slice(0, 1), 1, 1, 'R16UI'), this.range, 0, 0);
+  }
+
+  /** Samples from one that is held to the next, at a place. */
+  spacingAt({ u, v }: Place): number {
+    const { data, width } = this.levels[0].image as { data: Uint8Array; width: number };
+    const [column, row] = [Math.floor(u * this.info.width), Math.floor(v * this.info.height)];
+    return 2 ** (data[Math.floor(row / RANGE_BLOCK) * width + Math.floor(column / RANGE_BLOCK)]! / 2);
   }
 
   /** Take rectangles that have changed, and the levels then held. */
@@ -198,15 +207,15 @@ export class Surface {
     changed.forEach(({ x, y, width, height, cells }, index) => {
       const last = index === changed.length - 1;
       this.dense.generateMipmaps = this.mipmaps && last;
-      const smaller = shrink(cells as Uint8Array, x, y, width, height, this.shrunk);
-      if (smaller.width && smaller.height) this.upload(colours(smaller.cells, smaller.width, smaller.height), this.dense, smaller.x, smaller.y);
+      const smaller = shrink({ x, y, width, height, cells: cells as Uint8Array }, this.shrunk);
+      this.upload(colours(smaller.cells, smaller.width, smaller.height), this.dense, smaller.x, smaller.y);
     });
   }
 
   /** The refined colour's texture, transparent; it takes memory only once something is refined. */
   private makeDense(): void {
     this.dense.dispose();
-    const [width, height] = [Math.floor(this.info.textureWidth / this.shrunk), Math.floor(this.info.textureHeight / this.shrunk)];
+    const [width, height] = [Math.ceil(this.info.textureWidth / this.shrunk[0]), Math.ceil(this.info.textureHeight / this.shrunk[1])];
     this.dense = colours(null, width, height);
     this.dense.source.dataReady = false; // nothing to send: the card clears it
     this.dense.minFilter = this.mipmaps ? LinearMipmapLinearFilter : LinearFilter;
@@ -250,22 +259,6 @@ function colours(data: Uint8Array | null, width: number, height: number): DataTe
   texture.colorSpace = NoColorSpace;
   texture.needsUpdate = true;
   return texture;
-}
-
-/** Every `by`-th texel of a rectangle, where a texture of full size does not fit. */
-function shrink(cells: Uint8Array, x: number, y: number, width: number, height: number, by: number) {
-  if (by === 1) return { cells, x, y, width, height };
-  const [left, top] = [Math.ceil(x / by), Math.ceil(y / by)];
-  const [right, bottom] = [Math.floor((x + width - 1) / by), Math.floor((y + height - 1) / by)];
-  const small = new Uint8Array(4 * Math.max(0, right - left + 1) * Math.max(0, bottom - top + 1));
-  let at = 0;
-  for (let row = top; row <= bottom; row++) {
-    for (let column = left; column <= right; column++, at += 4) {
-      const from = 4 * ((row * by - y) * width + column * by - x);
-      small.set(cells.subarray(from, from + 4), at);
-    }
-  }
-  return { cells: small, x: left, y: top, width: right - left + 1, height: bottom - top + 1 };
 }
 
 /** A rectangle with so many cells more on all sides. */
