@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from node.state import ClientState
-from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, VOID, BoolArray, ImageArray, StepArray
-from protocol.lattice import NO_SKIRT, RHO_MAX, RHO_ONE, Channel, Parameters, mask_to_runs
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, VOID, BoolArray, ImageArray, IntArray, StepArray
+from protocol.lattice import (
+    NO_SKIRT,
+    RHO_MAX,
+    RHO_ONE,
+    STRIDE_MAX,
+    STRIDES,
+    Channel,
+    ChannelShape,
+    Parameters,
+    mask_to_runs,
+)
 from protocol.reconstruct import Selection, range_patch
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
 from protocol.region import Region
+from protocol.rings import ring_strides
 from protocol.strips import Strip, Strips, join_parts, samples_of
 
 FRAME_BYTES = 10  # WebSocket's own, at most
+MERGED_SAMPLES = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,17 +133,51 @@ def rho_of(s: float | None) -> int:
     return min(max(round(RHO_ONE * math.exp(1 / s)), RHO_ONE), RHO_MAX)
 
 
-def region_lattice(region: Region, channel: Channel, half_spacing: int, rho: int = NO_SKIRT) -> Parameters:
+def region_lattice(
+    region: Region, channel: Channel, half_spacing: int, rho: int = NO_SKIRT, stride_max: int = STRIDE_MAX
+) -> Parameters:
     """The lattice of the blocks that a region touches; of a cap they are listed, and it has no skirt."""
     side = RANGE_BLOCK if channel is Channel.RANGE else TEXTURE_BLOCK
     touched = region.touched(side)
     if touched.all():
-        return Parameters(half_spacing, *region.blocks(side), rho, rho)
-    return Parameters(half_spacing, *region.blocks(side), listed=mask_to_runs(touched))
+        return Parameters(half_spacing, *region.blocks(side), rho, rho, stride_max=stride_max)
+    return Parameters(half_spacing, *region.blocks(side), listed=mask_to_runs(touched), stride_max=stride_max)
+
+
+@lru_cache(maxsize=64)
+def widest_strips(shape: ChannelShape, region: Region) -> int:
+    """The largest stride of strips that a region's best travels in: few strips, of at most MERGED_SAMPLES times as many
+    samples. Where strips meet a codec pays for both edges, which costs more than samples that lie a little denser."""
+    if not shape.sphere:
+        return STRIDE_MAX
+    touched = region.touched(shape.block)
+    strides = ring_strides(shape.width, shape.height, shape.block)[region.blocks(shape.block)[1] :][: len(touched)]
+    fewest = _samples_in_strips(touched, strides)
+    for stride in STRIDES[STRIDES.index(strides.min()) :]:
+        if _samples_in_strips(touched, np.minimum(strides, stride)) <= MERGED_SAMPLES * fewest:
+            return stride
+    return STRIDE_MAX
+
+
+def _samples_in_strips(touched: BoolArray, strides: IntArray) -> float:
+    """How many samples strips of these strides have, in blocks of stride 1; the bounds are those of protocol.strips."""
+    total = 0.0
+    starts = np.flatnonzero(np.diff(strides, prepend=0))
+    for rows, stride in zip(np.split(touched, starts[1:]), strides[starts].tolist(), strict=True):
+        columns = np.flatnonzero(rows.any(axis=0))
+        gap = np.diff(columns, append=columns[0] + touched.shape[1]).max()
+        total += len(rows) * min(touched.shape[1], touched.shape[1] - int(gap) + 1) / stride
+    return total
 
 
 def own_inside(region: Region, selection: Selection) -> BoolArray:
-    """Which own samples of a selection's rectangle lie in a region. (rows, columns) bool"""
-    rows = selection.y.start + np.arange(selection.y.low.size)
-    columns = selection.x.start + np.arange(int(selection.x.size.sum()))
-    return region.inside(rows, columns * selection.lattice.shape.stride)
+    """Which own samples of a selection's rectangle lie in a region. (rows, columns) bool, read-only"""
+    rows = selection.y.start, selection.y.low.size
+    return _inside(region, *rows, selection.x.start, int(selection.x.size.sum()), selection.lattice.shape.stride)
+
+
+@lru_cache(maxsize=16)
+def _inside(region: Region, top: int, height: int, left: int, width: int, stride: int) -> BoolArray:
+    inside = region.inside(np.arange(top, top + height), np.arange(left, left + width) * stride)
+    inside.flags.writeable = False
+    return inside

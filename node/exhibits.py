@@ -171,7 +171,9 @@ class Exhibits:
             with self._way.given():
                 return self._closing.is_set()
 
-        return TextureModel(scan.texture, texture_as_seen(view), is_over)
+        return TextureModel(
+            scan.texture, texture_as_seen(view), is_over, sphere=scan.spec.geometry == "sphere"
+        )
 
     def _let_looks_go_first(self) -> None:
         """Pause for a moment while looks wait: what is measured serves those to come."""

@@ -149,7 +149,7 @@ class _Planner:
             if explicit.range:
                 self._take(self._code_range(explicit.range, self._range_region, quick=True), settle=False)
             if explicit.texture:
-                self._take(self._code_texture(explicit.texture, self._texture_region))
+                self._take(self._code_texture(explicit.texture, self._texture_region, merged=False))
             return
         wanted, range_bytes = self._divide()
         aim, limit = self._left - range_bytes - self._spare / 2, self._left - RANGE_LEAST * range_bytes
@@ -267,9 +267,9 @@ class _Planner:
         self._encodes.add()
         return code_range(self._scan, self._state, region, wanted, quick=quick)
 
-    def _code_texture(self, wanted: TextureParameters, region: Region) -> Coded | None:
+    def _code_texture(self, wanted: TextureParameters, region: Region, *, merged: bool = True) -> Coded | None:
         self._encodes.add()
-        return code_texture(self._scan, self._state, region, wanted, quick=self._quick)
+        return code_texture(self._scan, self._state, region, wanted, quick=self._quick, merged=merged)
 
     def _take(self, coded: Coded | None, *, settle: bool = True) -> None:
         """Add a refinement to the update, if it fits what is left; note its errors at once or later."""

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of
+from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of, widest_strips
 from node.library import Scan
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
@@ -20,7 +20,7 @@ from protocol.codec import RangeCodec, encode_mask
 from protocol.codec_lift import Survey, encode_and_decode
 from protocol.grid import RANGE_BLOCK, VOID, IntArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
-from protocol.lattice import Channel, Lattice, Parameters
+from protocol.lattice import NO_SKIRT, STRIDE_MAX, Channel, Lattice, Parameters
 from protocol.messages import RangeParameters
 from protocol.reconstruct import Selection, content_hashes, cut, range_patch
 from protocol.region import Region
@@ -77,7 +77,8 @@ def trial_of(scan: Scan, state: ClientState, region: Region, p: int) -> Trial | 
     if scan.spec.width % p:
         return None
     fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
-    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p))
+    stride = widest_strips(fresh.shape, region)
+    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p, NO_SKIRT, stride))
     strips = select_strips(lattices, fresh, range_rank(1))
     return Trial(scan, strips, region) if strips else None
 
@@ -87,11 +88,12 @@ def code_range(
 ) -> Coded | None:
     """Encode a refinement of the region's blocks, or None when the client holds all of it already.
 
-    quick : spare time rather than bytes.
+    quick : spare time rather than bytes, on a sphere in strips of own samples only.
     Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
     Raises LatticeError for a spacing that does not fit the scan.
     """
-    return code_range_lattice(scan, state, range_lattice(region, wanted), wanted.quantum, quick=quick)
+    parameters = range_lattice(state, region, wanted, merged=not quick)
+    return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick)
 
 
 def code_range_lattice(
@@ -114,7 +116,7 @@ def _code_strip(scan: Scan, strip: Strip, quantum: int, quick: bool) -> Part:
 
 def select_range(state: ClientState, region: Region, wanted: RangeParameters) -> tuple[Strips, int]:
     """What code_range would carry, if anything, and its quantum."""
-    return select_range_lattice(state, range_lattice(region, wanted), wanted.quantum)
+    return select_range_lattice(state, range_lattice(state, region, wanted), wanted.quantum)
 
 
 def select_range_lattice(state: ClientState, parameters: Parameters, quantum: int) -> tuple[Strips, int]:
@@ -140,10 +142,10 @@ def _surveyed(scan: Scan, selection: Selection, quantum: int) -> float:
     return Survey(samples, quantum, seen).expected_bytes
 
 
-def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
-    """The lattice of a region's blocks."""
-    rho = rho_of(wanted.s)
-    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho)
+def range_lattice(state: ClientState, region: Region, wanted: RangeParameters, *, merged: bool = True) -> Parameters:
+    """The lattice of a region's blocks; merged : of a sphere in as few strips as pays."""
+    stride = widest_strips(state.shapes[Channel.RANGE], region) if merged else STRIDE_MAX
+    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho_of(wanted.s), stride)
 
 
 def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:

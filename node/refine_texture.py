@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from node.coded import Coded, Part, own_inside, region_lattice, rho_of
+from node.coded import Coded, Part, own_inside, region_lattice, rho_of, widest_strips
 from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
@@ -17,7 +18,7 @@ from node.texture_model import SPACINGS, TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
 from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
 from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
-from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, mask_to_runs
+from protocol.lattice import STRIDE_MAX, Channel, ChannelShape, Lattice, Parameters, mask_to_runs
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
@@ -37,11 +38,10 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
     """
     if codec == "htj2k":
         return 1
-    shape = state.shapes[Channel.TEXTURE]
     allowed = mse_of_db(target_db) * SHARE_OF_ERROR
     for p in SPACINGS[:-1]:
-        strips = _whole(shape, region, p)
-        total, count = 0.0, 0
+        strips = _whole(state, region, p)
+        total, count = 0.0, 0.0
         for selection in (strip.selection for strip in strips):
             patch = texture_patch(selection, texture_samples(scan, selection))
             error, values = _patch_error(scan, selection, region, patch)
@@ -52,17 +52,22 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
 
 
 def code_texture(
-    scan: Scan, state: ClientState, region: Region, wanted: TextureParameters, *, quick: bool = False
+    scan: Scan,
+    state: ClientState,
+    region: Region,
+    wanted: TextureParameters,
+    *,
+    quick: bool = False,
+    merged: bool = True,
 ) -> Coded | None:
     """Encode a refinement of the region's blocks, or None when the client holds all of it already.
 
-    quick : where the link is fast, spare time rather than bytes.
+    quick : where the link is fast, spare time rather than bytes.   merged : as texture_lattice has it.
     Where a block that would become finer is held at a better quality, the whole refinement takes that one (F-09c).
     Raises LatticeError for a spacing that does not fit, CodecError for a quality the codec does not have.
     """
-    return code_texture_lattice(
-        scan, state, texture_lattice(region, wanted), wanted.quality, CODECS[wanted.codec], quick=quick
-    )
+    parameters = texture_lattice(state, region, wanted, merged=merged)
+    return code_texture_lattice(scan, state, parameters, wanted.quality, CODECS[wanted.codec], quick=quick)
 
 
 def code_texture_lattice(
@@ -91,7 +96,7 @@ def listed_texture(state: ClientState, region: Region, target_mse: float) -> tup
 
 def select_texture(state: ClientState, region: Region, wanted: TextureParameters) -> tuple[Strips, int]:
     """What code_texture would carry, if anything, and how good."""
-    return _select(state, texture_lattice(region, wanted), wanted.quality)
+    return _select(state, texture_lattice(state, region, wanted), wanted.quality)
 
 
 def _select(state: ClientState, parameters: Parameters, quality: int) -> tuple[Strips, int]:
@@ -101,9 +106,12 @@ def _select(state: ClientState, parameters: Parameters, quality: int) -> tuple[S
     return select_strips(lattices, held, texture_rank(best)), best
 
 
-def texture_lattice(region: Region, wanted: TextureParameters) -> Parameters:
-    """The lattice of a region's blocks."""
-    return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s))
+def texture_lattice(
+    state: ClientState, region: Region, wanted: TextureParameters, *, merged: bool = True
+) -> Parameters:
+    """The lattice of a region's blocks; merged : of a sphere in as few strips as pays."""
+    stride = widest_strips(state.shapes[Channel.TEXTURE], region) if merged else STRIDE_MAX
+    return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s), stride)
 
 
 def note_texture(scan: Scan, state: ClientState, coded: Coded) -> None:
@@ -147,25 +155,32 @@ def adopted_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, floa
     for part in coded.parts:
         if part.patch is not None:
             error, values = _patch_error(scan, part.selection, region, part.patch)
-            area = _area_of_value(part.selection)
-            total, count = total + area * error, count + area * values
+            total, count = total + error, count + values
     return total, count
 
 
-def _area_of_value(selection: Selection) -> float:
-    """How much area an own texel has in the middle of a strip, in texels of the equator."""
-    shape, y = selection.lattice.shape, selection.y
-    middle = y.start + y.low.size / 2
-    return shape.stride * math.sin(math.pi * middle / shape.height) if shape.sphere else 1.0
-
-
-def _patch_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, int]:
+def _patch_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, float]:
     """The same of one strip's patch."""
     wanted = (selection.adopted_cells() & own_inside(region, selection)).view(np.uint8)
     own = slice(0, wanted.shape[1])
-    truth = np.asarray(cut(scan.texture, selection))[:, own]
-    total = cv2.norm(np.ascontiguousarray(patch[:, own]), np.ascontiguousarray(truth), cv2.NORM_L2SQR, wanted)
-    return total, 3 * cv2.countNonZero(wanted)
+    truth = np.ascontiguousarray(np.asarray(cut(scan.texture, selection))[:, own])
+    patch = np.ascontiguousarray(patch[:, own])
+    total = count = 0.0
+    for rows, area in _bands(selection):
+        total += area * cv2.norm(patch[rows], truth[rows], cv2.NORM_L2SQR, wanted[rows])
+        count += area * 3 * cv2.countNonZero(wanted[rows])
+    return total, count
+
+
+def _bands(selection: Selection) -> Iterator[tuple[slice, float]]:
+    """Rows of a patch over which texels are about as wide, and the area of one there, in texels of the equator."""
+    shape, first, rows = selection.lattice.shape, selection.y.start, selection.y.low.size
+    if not shape.sphere:
+        yield slice(0, rows), 1.0
+        return
+    for top in range(0, rows, TEXTURE_BLOCK):
+        bottom = min(top + TEXTURE_BLOCK, rows)
+        yield slice(top, bottom), shape.stride * math.sin(math.pi * (first + (top + bottom) / 2) / shape.height)
 
 
 def left_alone(state: ClientState, coded: Coded | None, region: Region) -> BoolArray:
@@ -243,9 +258,9 @@ def quality_bounds(codec: str) -> tuple[int, int]:
     return (JPEG_QUALITY_MIN, JPEG_QUALITY_MAX) if codec == "jpeg" else (0, LOSSY_MAX)
 
 
-def _whole(shape: ChannelShape, region: Region, p: float) -> Strips:
+def _whole(state: ClientState, region: Region, p: float) -> Strips:
     """What a client that has the first view alone would be sent of a region at a spacing, if it fits at all."""
-    parameters = texture_lattice(region, TextureParameters(p=p))
+    shape, parameters = state.shapes[Channel.TEXTURE], texture_lattice(state, region, TextureParameters(p=p))
     if parameters.blocks_wide == shape.blocks[1] and 2 * shape.width % parameters.half_spacing:
         return ()
     return select_strips(build_strips(shape, parameters), ChannelHoldings.coarse(shape), texture_rank(0))

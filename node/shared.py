@@ -9,8 +9,8 @@ A cache of ours asks nobody who they are. So where there are logins, it asks us 
 cache reads. Browsers and whatever else is in between are told to keep nothing.
 
     /v1/scans/{scan}/fovea/{epoch}/{range}/{texture}
-    range    p2.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quantum        or -
-    texture  p2.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quality.codec  or -
+    range    spacing.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quantum        or -
+    texture  spacing.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quality.codec  or -
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.errors import CodecError, LatticeError, LibraryError
 from protocol.lattice import Channel, Parameters
+from protocol.refinement import from_spacing_byte, spacing_byte
 
 PLANS_KEPT = 1024
 BODIES_KEPT = 256
@@ -174,7 +175,7 @@ def canonical_path(scan_id: str, epoch: str, coded: tuple[Coded, ...]) -> str:
     parts = {"range": NONE, "texture": NONE}
     for one in coded:
         p = one.parameters
-        numbers = [p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y, one.quality]
+        numbers = [spacing_byte(p), p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y, one.quality]
         codec = [] if one.channel is Channel.RANGE else [int(one.codec)]
         parts[one.channel.name.lower()] = ".".join(map(str, [*numbers, *codec, *(p.listed or ())]))
     return f"/v1/scans/{scan_id}/fovea/{epoch}/{parts['range']}/{parts['texture']}"
@@ -201,9 +202,10 @@ def _encode(scan: Scan, view: FirstView, range_part: str, texture_part: str) -> 
 
 
 def _parameters(
-    p2: int, x: int, y: int, wide: int, high: int, rho_x: int, rho_y: int, *, listed: tuple[int, ...] | None
+    spacing: int, x: int, y: int, wide: int, high: int, rho_x: int, rho_y: int, *, listed: tuple[int, ...] | None
 ) -> Parameters:
-    return Parameters(p2, x, y, wide, high, rho_x, rho_y, listed)
+    half_spacing, stride_max = from_spacing_byte(spacing)
+    return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, listed, stride_max)
 
 
 def _numbers(text: str, count: int) -> tuple[list[int], list[int], tuple[int, ...] | None]:

@@ -4,7 +4,7 @@ The whole texture is coded at a few qualities by each codec, tile by tile, when 
 guess at a quality is nearly always the right one, so that an update is encoded once. A tile's bytes are spread over its
 cells by how much detail each keeps; what any image takes however little is in it, so that a patch has it once and not
 for each of its tiles, is found by coding some tiles again, four in one. What is still missed is learned from every
-update that is sent.
+update that is sent. Of a sphere the rows' own texels are coded, zone by zone of one stride (protocol.rings).
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from protocol.codec import (
     encode_texture,
 )
 from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray
+from protocol.lattice import STRIDE_MAX
 from protocol.region import Region
+from protocol.rings import ring_strides
 
 QUALITIES = {
     TextureCodec.HTJ2K: (6, 20, 34, 48, 62),
@@ -45,6 +47,7 @@ LOG_MSE_SLOPE = 0.08  # of a step of quality, on typical skin
 LOG_BYTES_SLOPE = 0.07
 BIAS_WEIGHT = 0.3
 WEIGHT_MIN = 0.1  # of a cell that keeps no detail, in doublings of error
+STRETCHED = 4  # steps of quality by which the quantiser acts finer on texels twice as dense along one axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +126,7 @@ class TextureModel:
 
     texture : (Ht, Wt, 3) uint8 RGB; coded whole, once, in the calling thread.
     first_view : the same as a client sees it that has nothing else; None: as bad as can be.
+    sphere : rows are polar angles, and hold fewer texels of their own near the poles.
     unwanted : asked between tiles; when true, the work is dropped and CancelledError raised.
     """
 
@@ -131,6 +135,8 @@ class TextureModel:
         texture: ImageArray,
         first_view: ImageArray | None = None,
         unwanted: Callable[[], bool] = lambda: False,
+        *,
+        sphere: bool = False,
     ) -> None:
         height, width = texture.shape[:2]
         self._cells = -(-height // CELL), -(-width // CELL)
@@ -138,26 +144,45 @@ class TextureModel:
         if first_view is not None:
             self._first_mse[:] = _cell_errors(texture, first_view)
         self._lock = threading.Lock()
+        self._stride = ring_strides(width, height, CELL) if sphere else np.ones(self._cells[0], np.int64)
+        self._area = 1.0 / self._stride
         self._measured = {
             (codec, p): _Measured(codec, p, self._cells) for codec in QUALITIES for p in SPACINGS
         }
         for measured in self._measured.values():
-            _survey(measured, texture, unwanted)
+            _survey_zones(measured, texture, self._stride, unwanted)
 
-    def expect(self, region: Region, codec: TextureCodec, p: int = 1, among: BoolArray | None = None) -> Expected:
+    def expect(
+        self,
+        region: Region,
+        codec: TextureCodec,
+        p: int = 1,
+        among: BoolArray | None = None,
+        stride_max: int = STRIDE_MAX,
+    ) -> Expected:
         """What the blocks that a region touches will take and reach at a spacing, or those among them.
 
         p : one of SPACINGS.   among : (rows, columns) of Region.blocks, bool; None: all that it touches.
+        stride_max : of the strips that they travel in.
         """
         measured = self._measured[codec, p]
         left, top, wide, high = region.blocks(CELL)
+        rows, columns = slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
         among = region.touched(CELL) if among is None else among
-        columns = (np.arange(left, left + wide) % self._cells[1])[None, :]
-        cells = (np.arange(top, top + high)[:, None] * self._cells[1] + columns)[among]
-        mse, content = (of.reshape(len(of), -1).take(cells, 1) for of in (measured.mse, measured.content))
-        size_bytes = content.sum(axis=1, dtype=np.float64) + measured.constant
-        log_mse = np.log(np.maximum(mse.mean(axis=1, dtype=np.float64), MSE_MIN)) if cells.size else 0 * size_bytes
-        return Expected(measured.qualities, log_mse, np.log(np.maximum(size_bytes * measured.bias, 1.0)))
+        counted = among.astype(np.float64)
+        content, mse = (
+            np.einsum("qrc,rc->qr", values[:, rows][:, :, columns], counted)
+            for values in (measured.content, measured.mse)
+        )
+        mse *= self._area[rows]
+        area = self._area[rows] @ among.sum(axis=1)
+        sent = np.minimum(self._stride[rows], stride_max)
+        denser = STRETCHED * np.log2(self._stride[rows] / sent)
+        content, mse = (_shifted(measured.qualities, values, denser) for values in (content, mse))
+        images = 1 + np.count_nonzero(np.diff(sent))
+        log_mse = np.log(np.maximum(mse / area, MSE_MIN)) if area else 0 * mse
+        size_bytes = (content + images * measured.constant) * measured.bias
+        return Expected(measured.qualities, log_mse, np.log(np.maximum(size_bytes, 1.0)))
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
         """Squared error per value of single blocks at qualities of their own; -1 is the first view. (n,) each"""
@@ -174,6 +199,34 @@ class TextureModel:
             with self._lock:
                 ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
                 self._measured[codec, p].bias *= ratio**BIAS_WEIGHT
+
+
+def _shifted(qualities: tuple[int, ...], values: FloatArray, by: FloatArray) -> FloatArray:
+    """The sum over rows of values (qualities, rows), each row's taken at qualities higher `by` so much. (qualities,)"""
+    total = values[:, by == 0].sum(axis=1)
+    scale = np.array(qualities, np.float64)
+    for shift in np.unique(by[by > 0]).tolist():
+        known = np.log(np.maximum(values[:, by == shift].sum(axis=1), MSE_MIN))
+        row = Expected(qualities, known, known)
+        total = total + np.array([row.mse(quality) for quality in scale + shift])
+    return np.asarray(total)
+
+
+def _survey_zones(
+    measured: _Measured, texture: ImageArray, stride: IntArray, unwanted: Callable[[], bool]
+) -> None:
+    """Survey each zone of rows of one stride as an image of its own texels; what came of it is its cells'."""
+    starts, largest = np.flatnonzero(np.diff(stride, prepend=0)), 0
+    for first, last in zip(starts.tolist(), [*starts[1:].tolist(), stride.size], strict=True):
+        t = int(stride[first])
+        own = np.ascontiguousarray(texture[first * CELL : last * CELL, ::t])
+        zone = _Measured(measured.codec, measured.p, (last - first, -(-own.shape[1] // CELL)))
+        _survey(zone, own, unwanted)
+        columns = measured.mse.shape[2]
+        measured.mse[:, first:last] = zone.mse.repeat(t, axis=2)[:, :, :columns]
+        measured.content[:, first:last] = zone.content.repeat(t, axis=2)[:, :, :columns] / t
+        if own.size > largest:
+            largest, measured.constant = own.size, zone.constant
 
 
 def _survey(measured: _Measured, texture: ImageArray, unwanted: Callable[[], bool]) -> None:

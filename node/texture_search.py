@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from node.coded import Coded, framed, message_overhead
+from node.coded import Coded, framed, message_overhead, widest_strips
 from node.library import Scan
 from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch
 from node.refine_texture import (
@@ -78,6 +78,7 @@ class TextureSearch:
         self._quick, self._encodes = quick, encodes
         self._tries = 1 if hurried else TRIES
         self._target_mse = mse_of_db(look.texture_db)
+        self._stride_max = widest_strips(state.shapes[Channel.TEXTURE], region)
         self._lowest, self._highest = quality_bounds(codec)
         self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
         self.limited = False
@@ -128,10 +129,10 @@ class TextureSearch:
         if self._model is None:
             return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
         if listed is None:
-            return self._model.expect(self._region, CODECS[self._codec], p)
+            return self._model.expect(self._region, CODECS[self._codec], p, None, self._stride_max)
         among = self._blocks(listed)
         kept_error, kept = self._held_error(~among & self._region.touched(TEXTURE_BLOCK))
-        expected = self._model.expect(self._region, CODECS[self._codec], p, among)
+        expected = self._model.expect(self._region, CODECS[self._codec], p, among, self._stride_max)
         return expected.beside(1 - kept / max(3 * self._region.area, kept), kept_error / max(kept, 1))
 
     def _blocks(self, listed: tuple[int, ...]) -> BoolArray:
@@ -223,7 +224,7 @@ class TextureSearch:
     def _code(self, p: int, quality: int, listed: tuple[int, ...] | None) -> Coded | None:
         self._encodes.add()
         wanted = TextureParameters(p, quality, self._codec, self.skirt(p))
-        parameters = texture_lattice(self._region, wanted)
+        parameters = texture_lattice(self._state, self._region, wanted)
         if listed is not None:
             parameters = replace(parameters, listed=listed)
         return code_texture_lattice(
@@ -250,5 +251,6 @@ class TextureSearch:
         if self._model is not None and self._look.alpha is None:
             codec = CODECS[self._codec]
             sent = self._region.touched(TEXTURE_BLOCK) & ~left_alone(self._state, coded, self._region)
-            expected = self._model.expect(self._region, codec, p, sent)
+            expected = self._model.expect(self._region, codec, p, sent, self._stride_max)
             self._model.learn(codec, p, expected.size_bytes(coded.quality), len(coded.payload))
+            self._known.clear()

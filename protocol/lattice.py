@@ -22,6 +22,8 @@ QUARTERS = 4
 RHO_ONE = 1 << 16
 RHO_MAX = 1 << 20
 NO_SKIRT = 0
+STRIDE_MAX = TEXTURE_BLOCK
+STRIDES = (1, 2, 4, 8, STRIDE_MAX)
 LEVEL_MAX = 40
 _LEVEL_BOUNDS = (QUARTERS * QUARTERS) * (1 << np.arange(LEVEL_MAX, dtype=np.int64))
 
@@ -39,7 +41,8 @@ class ChannelShape:
 
     width, height : dense samples.  coarse_width, coarse_height : samples of the first view.  block : side of a block.
     sphere : rows are directions' polar angles; near the poles they hold fewer samples of their own (protocol.rings).
-    stride : of a strip of such rows: how many columns apart these samples stand.
+    stride : of a strip of such rows: how many columns apart its samples stand.
+    own_stride : and how many the rows' own do, at most; more than stride where that was limited.
     """
 
     channel: Channel
@@ -49,6 +52,7 @@ class ChannelShape:
     coarse_height: int
     sphere: bool = False
     stride: int = 1
+    own_stride: int = 1
 
     def __post_init__(self) -> None:
         if not (1 <= self.coarse_width <= self.width and 1 <= self.coarse_height <= self.height):
@@ -71,8 +75,8 @@ class ChannelShape:
 
     @property
     def beyond(self) -> int:
-        """How many own samples right of a block its cells hang on: the next one, where there are cells between."""
-        return int(self.stride > 1)
+        """How many samples right of a block its cells hang on: the next one, where there are cells between."""
+        return int(self.own_stride > 1)
 
     @property
     def blocks(self) -> tuple[int, int]:
@@ -113,6 +117,8 @@ class Parameters:
     block_x, block_y, blocks_wide, blocks_high : the plateau, in blocks; it may wrap in x, not in y.
     rho_x, rho_y : growth of the skirt's steps, round(65536 exp(1/S')), 65536..2^20; 0 for no skirt.
     listed : None, or run lengths over the plateau's blocks in row order, unlisted first: only listed ones are adopted.
+    stride_max : on a sphere, the most columns from one sample of a strip to the next, a power of two: the fewer, the
+    fewer and wider strips (protocol.strips). STRIDE_MAX everywhere else.
     """
 
     half_spacing: int
@@ -123,6 +129,7 @@ class Parameters:
     rho_x: int = NO_SKIRT
     rho_y: int = NO_SKIRT
     listed: tuple[int, ...] | None = None
+    stride_max: int = STRIDE_MAX
 
     @property
     def spacing(self) -> float:
@@ -228,6 +235,8 @@ def check_parameters(shape: ChannelShape, p: Parameters) -> None:
         raise LatticeError(f"rho must be {NO_SKIRT} or between {RHO_ONE} and {RHO_MAX}")
     if shape.channel is Channel.RANGE and 2 * shape.width % p.half_spacing:
         raise LatticeError(f"spacing {p.spacing} does not divide the {shape.width} columns")
+    if p.stride_max not in (STRIDES if shape.sphere else (STRIDE_MAX,)):
+        raise LatticeError(f"a largest stride of {p.stride_max} does not fit the scan")
     if p.blocks_wide == columns and (p.block_x or 2 * shape.width % p.half_spacing):
         raise LatticeError("a plateau all round must start at block 0 and its spacing divide the width")
 

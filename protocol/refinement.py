@@ -10,10 +10,11 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
-from protocol.lattice import Channel, Parameters
+from protocol.lattice import STRIDE_MAX, Channel, Parameters
 from protocol.sphere_fovea import SphereParameters
 
 MAGIC = 0x5246
@@ -25,6 +26,7 @@ PARAMETERS_MAX = 4096
 MASK_MAX = 8 << 20
 PAYLOAD_MAX = 256 << 20
 VARINT_MAX = 5
+SPACING_BITS = 5  # of the byte that half spacing and the largest stride share
 AnyParameters = Parameters | ClassicParameters | SphereParameters
 
 
@@ -110,6 +112,7 @@ def _unpacked(generator: Generator, data: bytes) -> AnyParameters | None:
     return unpack_parameters(data) if data else None
 
 
+@lru_cache(maxsize=16)
 def pack_parameters(p: Parameters) -> bytes:
     """Lattice parameters as they travel: 17 bytes, then the listed runs as varints when there are any.
 
@@ -118,7 +121,7 @@ def pack_parameters(p: Parameters) -> bytes:
     if p.listed is not None and not p.listed:
         raise LocalWireError("a list of blocks needs at least one run")
     try:
-        head = PARAMETERS.pack(p.half_spacing, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y)
+        head = PARAMETERS.pack(spacing_byte(p), p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y)
     except struct.error as error:
         raise LocalWireError(f"lattice parameters out of bounds: {error}") from None
     return head + b"".join(_varint(run) for run in p.listed or ())
@@ -129,8 +132,23 @@ def unpack_parameters(data: bytes) -> Parameters:
     if len(data) < PARAMETERS.size:
         raise RemoteWireError("lattice parameters are cut short")
     runs = _varints(data[PARAMETERS.size :])
-    half_spacing, block_x, block_y, wide, high, rho_x, rho_y = PARAMETERS.unpack_from(data)
-    return Parameters(half_spacing, block_x, block_y, wide, high, rho_x, rho_y, runs or None)
+    spacing, x, y, wide, high, rho_x, rho_y = PARAMETERS.unpack_from(data)
+    half_spacing, stride_max = from_spacing_byte(spacing)
+    return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, runs or None, stride_max)
+
+
+def spacing_byte(p: Parameters) -> int:
+    """Half spacing, and in the upper three bits one more than the exponent of the largest stride, 0 for no limit."""
+    if p.half_spacing >> SPACING_BITS:
+        raise LocalWireError(f"a spacing of {p.spacing} does not travel")
+    exponent = 0 if p.stride_max == STRIDE_MAX else p.stride_max.bit_length()
+    return p.half_spacing | exponent << SPACING_BITS
+
+
+def from_spacing_byte(spacing: int) -> tuple[int, int]:
+    """Inverse of spacing_byte: half spacing and largest stride."""
+    half_spacing, exponent = spacing % (1 << SPACING_BITS), spacing >> SPACING_BITS
+    return half_spacing, 1 << exponent - 1 if exponent else STRIDE_MAX
 
 
 def _read_header(data: bytes) -> tuple[Generator, Channel, int, int, int, int, int, int, int, tuple[int, int, int]]:

@@ -64,6 +64,7 @@ class Cap(Region):
     row_left: IntArray
     row_width: IntArray
     row_share: FloatArray
+    __eq__, __hash__ = object.__eq__, object.__hash__  # two caps may have one rectangle
 
     @property
     def area(self) -> float:
@@ -74,12 +75,13 @@ class Cap(Region):
         """Which of rows x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
         row = np.clip(rows - self.top, 0, self.height - 1)
         width = np.where((rows >= self.top) & (rows < self.top + self.height), self.row_width[row], 0)
-        turn = self.turn
-        first = (columns[:1] - self.row_left[row])[:, None] % turn
-        away = first + (columns - columns[:1])
-        if columns.size and columns[-1] - columns[0] < turn:  # no division for every sample: they are many
-            return np.asarray((away < width[:, None]) | ((away >= turn) & (away < width[:, None] + turn)))
-        return np.asarray(away % turn < width[:, None])
+        first = (columns[:1] - self.row_left[row]) % self.turn
+        away = columns - columns[:1]
+        inside = away < (width - first)[:, None]
+        for turns in range(1, int((first + away[-1:]).max(initial=0)) // self.turn + 1):
+            begin = turns * self.turn - first
+            inside |= (away >= begin[:, None]) & (away < (begin + width)[:, None])
+        return np.asarray(inside)
 
     def touched(self, side: int) -> BoolArray:
         """Which blocks of that rectangle it touches. (rows, columns) bool"""

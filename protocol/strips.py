@@ -57,11 +57,15 @@ def build_strips(shape: ChannelShape, parameters: Parameters) -> tuple[Lattice, 
         return (build_lattice(shape, parameters),)
     check_parameters(shape, parameters)
     y = axis_y(shape, parameters)
-    stride = ring_strides(shape.width, shape.height, shape.block, parameters.half_spacing)[y.block]
+    own, fitting = (
+        ring_strides(shape.width, shape.height, shape.block, half)[y.block] for half in (2, parameters.half_spacing)
+    )
+    stride = np.minimum(fitting, parameters.stride_max)
     first = np.flatnonzero(np.diff(stride, prepend=0))
     strips = []
     for begin, end in zip(first.tolist(), [*first[1:].tolist(), stride.size], strict=True):
-        strip = _build_strip(replace(shape, stride=int(stride[begin])), parameters, _rows(y, slice(begin, end)))
+        strip_shape = replace(shape, stride=int(stride[begin]), own_stride=int(own[begin:end].max()))
+        strip = _build_strip(strip_shape, parameters, _rows(y, slice(begin, end)))
         if strip is not None:
             strips.append(strip)
     return tuple(strips)

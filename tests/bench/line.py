@@ -232,7 +232,7 @@ def texture_patch_sent(scan: Scan, view: FirstView, look: Look) -> ImageArray:
     shape = view.state.shapes[Channel.TEXTURE]
     assert look.parameters is not None and look.parameters.texture is not None
     region = region_round(look.u, look.v, look.window, shape.width, shape.height)
-    lattice = build_lattice(shape, texture_lattice(region, look.parameters.texture))
+    lattice = build_lattice(shape, texture_lattice(view.state, region, look.parameters.texture))
     found = select(lattice, ChannelHoldings.coarse(shape), texture_rank(QUALITY))
     assert found is not None
     return texture_samples(scan, found[0])

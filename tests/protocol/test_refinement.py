@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
-from protocol.lattice import NO_SKIRT, Channel, Parameters
+from protocol.lattice import NO_SKIRT, STRIDES, Channel, Parameters
 from protocol.refinement import (
     CRC,
     HEADER,
@@ -23,7 +23,9 @@ from protocol.refinement import (
 
 U16, U32 = st.integers(0, 0xFFFF), st.integers(0, 0xFFFFFFFF)
 RUNS = st.none() | st.lists(st.integers(0, 2**35 - 1), min_size=1, max_size=20).map(tuple)
-PARAMETERS = st.builds(Parameters, st.integers(0, 255), U16, U16, U16, U16, U32, U32, RUNS)
+PARAMETERS = st.builds(
+    Parameters, st.integers(0, 31), U16, U16, U16, U16, U32, U32, RUNS, st.sampled_from(STRIDES)
+)
 REFINEMENTS = st.builds(
     Refinement,
     generator=st.just(Generator.FOVEA),

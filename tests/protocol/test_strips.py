@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.codec_lift import decode, encode_and_decode
-from protocol.errors import CodecError
+from protocol.errors import CodecError, LatticeError
 from protocol.grid import VOID, BoolArray, StepArray
 from protocol.holdings import ChannelHoldings, range_rank, texture_rank
-from protocol.lattice import Channel, ChannelShape, Parameters, build_lattice, mask_to_runs
+from protocol.lattice import STRIDES, Channel, ChannelShape, Parameters, build_lattice, mask_to_runs
 from protocol.reconstruct import Selection, cut, paste, range_patch, select, texture_patch
 from protocol.rings import ring_strides, thin_rings, thin_texture
 from protocol.strips import blocks_of, build_strips, join_parts, samples_of, select_strips, split_parts
@@ -38,7 +38,7 @@ def windows(draw: st.DrawFn, shape: ChannelShape = SHAPE, skirts: bool = True) -
         random = np.random.default_rng(draw(st.integers(0, 999)))
         listed = mask_to_runs(random.random((high, wide)) < draw(st.sampled_from([0.1, 0.5, 0.9])))
     half = draw(st.sampled_from([2, 4, 8]))
-    return Parameters(half, block_x, block_y, wide, high, draw(rho), draw(rho), listed)
+    return Parameters(half, block_x, block_y, wide, high, draw(rho), draw(rho), listed, draw(st.sampled_from(STRIDES)))
 
 
 def surface(seed: int = 1, voids: float = 0.0) -> StepArray:
@@ -79,7 +79,8 @@ def test_no_block_is_covered_twice_and_listed_ones_are(parameters: Parameters) -
     for lattice in build_strips(SHAPE, parameters):
         covered[np.ix_(lattice.y.block, lattice.x.block)] += 1
         may[np.ix_(lattice.y.block, lattice.x.block)] |= lattice.listed
-        assert (ring_strides(96, 184, 8, parameters.half_spacing)[lattice.y.block] == lattice.shape.stride).all()
+        strides = ring_strides(96, 184, 8, parameters.half_spacing)[lattice.y.block]
+        assert (np.minimum(strides, parameters.stride_max) == lattice.shape.stride).all()
     assert covered.max(initial=0) <= 1
     assert np.array_equal(wanted(parameters) & (covered > 0), wanted(parameters))
     if parameters.listed is not None:
@@ -107,7 +108,7 @@ def test_a_strip_is_no_wider_than_what_is_listed_in_it(parameters: Parameters) -
 
 @given(windows(), st.integers(0, 3), st.sampled_from([0.0, 0.1]))
 def test_exact_windows_are_the_scans_and_nothing_else_changes(p: Parameters, seed: int, voids: float) -> None:
-    exact = Parameters(2, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, listed=p.listed)
+    exact = Parameters(2, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, 0, 0, p.listed, p.stride_max)
     scan, dense, held = surface(seed, voids), np.full((184, 96), 7, np.uint16), ChannelHoldings.coarse(SHAPE)
     refine(dense, held, scan, exact)
     np.testing.assert_array_equal(held.level == 0, wanted(exact))
@@ -127,6 +128,7 @@ def test_own_samples_of_a_plateau_are_within_half_a_quantum(p: Parameters, quant
         block_rows = np.isin(rows // 8, lattice.y.block)
         own[np.ix_(rows[block_rows], columns)] = True
     own &= cells_of(held.rank == range_rank(quantum))
+    own &= np.arange(96) % ring_strides(96, 184, 8).repeat(8)[:184, None] == 0  # a limited stride sends more than these
     assert own.any() == (held.rank > 0).any()
     assert np.abs(dense[own].astype(int) - scan[own]).max(initial=0) <= quantum // 2
 
@@ -242,3 +244,14 @@ def test_golden_scans_are_as_their_docstring_says() -> None:
 def test_blocks_of_strips_are_each_named_once(parameters: Parameters) -> None:
     blocks = blocks_of(select_strips(build_strips(SHAPE, parameters), ChannelHoldings.coarse(SHAPE), range_rank(1)))
     assert np.unique(blocks).size == blocks.size
+
+
+def test_a_largest_stride_joins_strips_and_only_on_a_sphere() -> None:
+    whole = Parameters(2, 0, 0, 12, 23)
+    for most, strides in {16: [8, 4, 2, 1, 2, 4, 8], 2: [2, 1, 2], 1: [1]}.items():
+        strips = build_strips(SHAPE, replace(whole, stride_max=most))
+        assert [lattice.shape.stride for lattice in strips] == strides
+    with pytest.raises(LatticeError, match="largest stride of 3"):
+        build_strips(SHAPE, replace(whole, stride_max=3))
+    with pytest.raises(LatticeError, match="largest stride of 2"):
+        build_strips(replace(SHAPE, sphere=False), replace(whole, stride_max=2))

@@ -16,13 +16,15 @@ import pytest
 from numpy.typing import NDArray
 
 from client import Model, RequestRefused, connect
+from client.shared import open_shared, refinements_in
 from client.transfer import send_scan
 from exchange.native import write_native
 from foveascan import started
 from protocol.errors import LocalWireError
 from protocol.grid import BoolArray, FloatArray, Grid, GridSpec, IntArray
-from protocol.lattice import QUARTERS, Channel
+from protocol.lattice import QUARTERS, Channel, Parameters
 from protocol.messages import PROTOCOL, Hello, Open, Refused, decode_message, encode_message
+from protocol.refinement import spacing_byte
 from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid, great_circle_rad, vectors
 from protocol.sphere_fovea import SphereParameters
@@ -266,6 +268,36 @@ async def test_a_look_by_direction_reaches_its_quality_across_a_pole(objects: Ob
         assert update.texture_db is not None and update.texture_db >= 40
         budget = await session.look_direction(3.0, 5.0, range_mm=0.1, texture_db=40, max_bytes=1000)
         assert 0 < budget.bytes_received <= 1000
+
+
+async def test_a_pole_by_plain_http_is_planned_once_and_as_good_as_by_the_stream(objects: Objects) -> None:
+    scan, asked = objects.scans["pebble"], {"range_mm": 0.1, "texture_db": 40.0}
+    async with aiohttp.ClientSession() as http:
+        plan = f"{objects.url}/v1/scans/{scan}/fovea?u=0&v=0&range_mm=0.1&texture_db=40"
+        places = []
+        for _ in range(2):
+            async with http.get(plan, allow_redirects=False) as planned:
+                assert planned.status == 303
+                places.append(planned.headers["Location"])
+        async with http.get(objects.url + places[0]) as response:
+            body = await response.read()
+    assert places[0] == places[1]
+    listed = refinements_in(body)
+    range_numbers = [int(part) for part in places[0].split("/")[-2].split(".")]
+    assert listed[0].self_contained and isinstance(listed[0].parameters, Parameters)
+    assert range_numbers[:2] == [spacing_byte(listed[0].parameters), listed[0].parameters.block_x]
+    async with open_shared(objects.url, scan) as viewer, connect(objects.url) as session:
+        streamed = await session.open(scan)
+        await session.look_direction(0.0, 0.0, **asked)
+        assert await viewer.look(0.0, 0.0, **asked) == len(body)
+        assert viewer.model.digest() == streamed.digest()
+        await viewer.look(0.0, 1 / 3, window=0.1, range_mm=0)  # overlaps: what is finer is adopted, as planned or not
+        held = viewer.model.digest()
+        await viewer.look(0.0, 1 / 3, window=0.1, range_mm=0)
+        assert viewer.model.digest() == held
+        true_mm = scan_of(*SCANS["pebble"]).range_mm
+        error, _ = left_in_cap(viewer.model, true_mm, 0.0, 0.0)
+        assert np.percentile(error, 99) <= 0.1 + STEP_MM / 100
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (-0.1, 0.0), (3.2, 0.0)])

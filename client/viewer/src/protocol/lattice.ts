@@ -9,6 +9,7 @@ export type Channel = typeof RANGE | typeof TEXTURE;
 export const CHANNELS: readonly Channel[] = [RANGE, TEXTURE];
 
 export const QUARTERS = 4;
+export const STRIDE_MAX = 16;
 const RHO_ONE = 1 << 16;
 const RHO_MAX = 1 << 20;
 const HALF_SPACINGS: Record<Channel, readonly number[]> = { [RANGE]: [2, 4, 8, 16], [TEXTURE]: [2, 3, 4, 6, 8, 12, 16] };
@@ -24,6 +25,8 @@ export interface ChannelShape {
   sphere?: boolean;
   /** Of a strip of such rows: how many columns apart these samples stand; 1 if it is not said. */
   stride?: number;
+  /** And how many its rows' own do, at most; more where the stride was limited; 1 if it is not said. */
+  ownStride?: number;
 }
 
 /** What travels of a lattice. */
@@ -36,6 +39,8 @@ export interface Parameters {
   rhoX: number;
   rhoY: number;
   listed: number[] | null;
+  /** On a sphere the largest stride of its strips; STRIDE_MAX, which is no limit, if it is not said. */
+  strideMax?: number;
 }
 
 /** One axis of a lattice: positions, the samples that stand there, and the blocks it covers. */
@@ -67,7 +72,7 @@ export const blocksAcross = (shape: ChannelShape): number => Math.ceil(shape.wid
 export const strideOf = (shape: ChannelShape): number => shape.stride ?? 1;
 export const ownWidth = (shape: ChannelShape): number => shape.width / strideOf(shape);
 /** How many own samples right of a block its cells hang on: the next one, where there are cells between. */
-export const beyond = (shape: ChannelShape): number => (strideOf(shape) > 1 ? 1 : 0);
+export const beyond = (shape: ChannelShape): number => ((shape.ownStride ?? 1) > 1 ? 1 : 0);
 export const blocksDown = (shape: ChannelShape): number => Math.ceil(shape.height / blockSide(shape));
 
 /** Level of a block that holds nothing but the first view. */
@@ -126,6 +131,7 @@ export function checkParameters(shape: ChannelShape, p: Parameters): void {
     p.blockX >= 0 && p.blockX < columns && p.blocksWide >= 1 && p.blocksWide <= columns &&
     p.blockY >= 0 && p.blocksHigh >= 1 && p.blockY + p.blocksHigh <= rows &&
     rhoFits(p.rhoX) && rhoFits(p.rhoY) &&
+    [...(shape.sphere ? [1, 2, 4, 8] : []), STRIDE_MAX].includes(p.strideMax ?? STRIDE_MAX) &&
     (shape.channel === TEXTURE || divides) &&
     (p.blocksWide < columns || (p.blockX === 0 && divides));
   if (!fits) throw new RemoteWireError(`no lattice: ${JSON.stringify(p)}`);

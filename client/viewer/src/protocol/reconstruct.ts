@@ -2,11 +2,12 @@
 // Range is interpolated exactly, so that every client gets the same grid; texture to within half a grey level.
 
 import { RemoteWireError } from './errors.ts';
-import { beyond, blocksAcross, QUARTERS, strideOf } from './lattice.ts';
+import { beyond, blockSide, blocksAcross, QUARTERS, strideOf } from './lattice.ts';
 import type { Axis, ChannelShape, Lattice } from './lattice.ts';
 import { hashBlock } from './holdings.ts';
 import type { ChannelHoldings } from './holdings.ts';
-import { widened } from './rings.ts';
+import { ringStrides, widen } from './rings.ts';
+import type { Samples } from './rings.ts';
 
 /**
  * One axis of a selection: the run of covered blocks round the adopted ones, and the samples they need.
@@ -203,9 +204,25 @@ function copyCells(samples: Uint8Array, y: Window, x: Window): Uint8Array {
 /** Dense columns of the windows' rectangle. */
 const denseColumns = ({ lattice: { shape }, x }: Selection): number => (x.low.length - beyond(shape)) * strideOf(shape);
 
-/** A patch of own samples with the cells between them: the windows' rectangle. parts: values of a sample. */
-export function denseOf<T extends Uint16Array | Uint8Array>(patch: T, selection: Selection, parts: number): T {
-  return widened(patch, selection.x.low.length, strideOf(selection.lattice.shape), parts);
+/**
+ * The windows' rectangle from a patch: cells between a row's own samples are interpolated. Where the strip's stride was
+ * limited, a patch has more columns than some rows have samples: only these count there. parts: values of a sample.
+ */
+export function denseOf<T extends Samples>(patch: T, selection: Selection, parts: number): T {
+  const { lattice: { shape }, x, y } = selection;
+  if (!shape.sphere) return patch;
+  const strides = ringStrides(shape.width, shape.height, blockSide(shape), 2);
+  const [columns, line] = [denseColumns(selection), x.low.length * parts];
+  const cells = new (patch.constructor as new (size: number) => T)(y.low.length * columns * parts);
+  let [from, to] = [0, 0];
+  y.block.forEach((block, j) => {
+    const own = strides[block]!;
+    for (let row = 0; row < y.size[j]!; row++, from += line, to += columns * parts) {
+      if (own === 1) cells.set(patch.subarray(from, from + columns * parts), to);
+      else widen(patch, from, own / strideOf(shape), cells, to, columns / own, own, parts);
+    }
+  });
+  return cells;
 }
 
 /** Where the windows' rectangle lies in the dense grid, cut at the seam. */

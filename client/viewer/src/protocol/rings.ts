@@ -17,29 +17,22 @@ export function ringStrides(width: number, height: number, side: number, halfSpa
   return stride;
 }
 
+export type Samples = Uint16Array | Uint8Array;
+
 /**
- * Own samples and the cells between them: rows of n + 1 samples to n stride cells, the last one only looked at.
- * Between a and b, k of t columns on: (2 (a (t - k) + b k) + t) // (2 t). parts: values of a sample; range, which has
- * one, is void where either end is.
+ * A row's own samples, `step` apart from `own[from]` on, and the cells between them, into `cells` from `to` on: n + 1
+ * samples to n stride cells, the last one only looked at. Between a and b, k of t columns on:
+ * (2 (a (t - k) + b k) + t) // (2 t). parts: values of a sample; range, which has one, is void where either end is.
  */
-export function widened<T extends Uint16Array | Uint8Array>(own: T, across: number, stride: number, parts: number): T {
-  if (stride === 1) return own;
-  const [columns, line] = [across - 1, across * parts];
-  const rows = own.length / line;
-  const cells = new (own.constructor as new (size: number) => T)(rows * columns * stride * parts);
+export function widen(own: Samples, from: number, step: number, cells: Samples, to: number, columns: number, stride: number, parts: number): void {
   const shift = Math.log2(stride) + 1; // divides by 2 t, a power of two
-  let to = 0;
-  for (let row = 0, from = 0; row < rows; row++, from += parts) {
-    for (let column = 0; column < columns; column++, from += parts, to += stride * parts) {
-      for (let part = 0; part < parts; part++) {
-        const a = own[from + part]!;
-        const b = own[from + part + parts]!;
-        const rising = 2 * (b - a);
-        let sum = (2 * a + 1) * stride;
-        for (let k = 0, at = to + part; k < stride; k++, at += parts, sum += rising) cells[at] = sum >> shift;
-      }
-      if (parts === 1 && (own[from] === 0 || own[from + 1] === 0)) cells.fill(0, to + 1, to + stride);
+  for (let column = 0; column < columns; column++, from += step * parts, to += stride * parts) {
+    for (let part = 0; part < parts; part++) {
+      const a = own[from + part]!;
+      const rising = 2 * (own[from + part + step * parts]! - a);
+      let sum = (2 * a + 1) * stride;
+      for (let k = 0, at = to + part; k < stride; k++, at += parts, sum += rising) cells[at] = sum >> shift;
     }
+    if (parts === 1 && (own[from] === 0 || own[from + step] === 0)) cells.fill(0, to + 1, to + stride);
   }
-  return cells;
 }

@@ -3,7 +3,9 @@
 
 import { RemoteWireError } from './errors.ts';
 import type { ChannelHoldings } from './holdings.ts';
-import { axisX, axisY, blockSide, blocksAcross, buildLattice, checkParameters, latticeOf, runsToMask } from './lattice.ts';
+import {
+  STRIDE_MAX, axisX, axisY, blockSide, blocksAcross, buildLattice, checkParameters, latticeOf, runsToMask,
+} from './lattice.ts';
 import type { Axis, ChannelShape, Lattice, Parameters } from './lattice.ts';
 import { select, selectionSamples } from './reconstruct.ts';
 import type { Chosen } from './reconstruct.ts';
@@ -16,12 +18,14 @@ export function buildStrips(shape: ChannelShape, p: Parameters): Lattice[] {
   if (!shape.sphere) return [buildLattice(shape, p)];
   checkParameters(shape, p);
   const y = axisY(shape, p);
-  const strides = ringStrides(shape.width, shape.height, blockSide(shape), p.halfSpacing);
+  const [owns, strides] = [2, p.halfSpacing].map((half) => ringStrides(shape.width, shape.height, blockSide(shape), half));
+  const strideOf = (block: number) => Math.min(strides![block]!, p.strideMax ?? STRIDE_MAX);
   const strips: Lattice[] = [];
   for (let begin = 0, end = 0; begin < y.block.length; begin = end) {
-    const stride = strides[y.block[begin]!]!;
-    while (end < y.block.length && strides[y.block[end]!] === stride) end++;
-    const strip = buildStrip({ ...shape, stride }, p, rowsOf(y, begin, end));
+    const stride = strideOf(y.block[begin]!);
+    while (end < y.block.length && strideOf(y.block[end]!) === stride) end++;
+    const ownStride = Math.max(...y.block.slice(begin, end).map((block) => owns![block]!));
+    const strip = buildStrip({ ...shape, stride, ownStride }, p, rowsOf(y, begin, end));
     if (strip) strips.push(strip);
   }
   return strips;
