@@ -29,6 +29,7 @@ MEDIA_TYPES: Mapping[str, str] = MappingProxyType(
         ".npz": "application/zip",
     }
 )
+NOT_CLOSED = "seen from its axis: not closed round a centre (--geometry sphere says why)"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".bmp")
 SIZES: Mapping[str, Size] = MappingProxyType(
     {
@@ -132,7 +133,7 @@ def as_wanted(
 
     if options.geometry in (None, found.grid.spec.geometry):
         if options.sweeps or options.caps:
-            raise ExchangeError(f"scan: is a {found.grid.spec.geometry} already")
+            raise ExchangeError(f"scan: is a {found.grid.spec.geometry} already; caps and sweeps complete a cylinder")
         return found
     if options.geometry == "cylinder":
         return found._replace(grid=unroll(found.grid), note=joined(found.note, "a sphere as its axis sees it"))
@@ -188,7 +189,8 @@ def _read_mesh(
     if options.geometry == "sphere" or centre_mm is not None:
         grid, seen = close_mesh(found, options.size, options.theta0_rad, centre_mm, progress)
         return Scanned("", grid, str(seen))
-    return Scanned("", cast_mesh(found, fit_spec(found.corners, options.size, options.theta0_rad), progress))
+    said = NOT_CLOSED if options.geometry is None else ""
+    return Scanned("", cast_mesh(found, fit_spec(found.corners, options.size, options.theta0_rad), progress), said)
 
 
 def _image(path: Path | None) -> ImageArray | None:

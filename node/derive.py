@@ -68,7 +68,8 @@ def derive(library: Library, scan_id: str, wanted: Wanted, progress: Callable[[f
     )
     source = library.open(scan_id)
     if wanted.geometry == source.spec.geometry:
-        raise ExchangeError(f"scan: is a {wanted.geometry} already")
+        other = "cylinder" if wanted.geometry == "sphere" else "sphere"
+        raise ExchangeError(f"scan: is a {wanted.geometry} already: name another (--scan ID), or --geometry {other}")
     found = Scanned(source.about.name, source.grid, source.about.note)
     made = as_wanted(found, options, progress)
     about = About(time.time(), "derived", made.name, note=made.note, made_from=(scan_id, *others))
