@@ -139,8 +139,8 @@ def test_a_scan_is_renamed_and_deleted_after_being_asked(browser: Browser, tmp_p
         line = aside.submit(run_line, stack, tmp_path, "--specimen", "cylinder", *FAST).result()
         with opened(browser, line.url) as page:
             page.locator("summary:has-text('This scan')").click()
-            page.get_by_label("Name").fill("back, left")
-            page.get_by_label("Subject code").fill("P-17")
+            page.get_by_role("textbox", name="Name").fill("back, left")
+            page.get_by_role("textbox", name="Subject code").fill("P-17")
             page.get_by_role("button", name="Save").click()
             page.get_by_role("button", name="back, left P-17").wait_for()
             assert page.request.get(f"{line.url}/v1/scans").json()[0]["subject"] == "P-17", "what a list shows"
