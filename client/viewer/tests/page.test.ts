@@ -187,7 +187,7 @@ test('the part of the picture that shows cells holds all of them, and little els
   const steps = alike(50);
   const facing = INFO.width * (0.5 - INFO.theta0Rad / (2 * Math.PI)); // the column at -x
   const cells = { x: Math.round(facing) - 20, y: 80, width: 40, height: 40 };
-  const part = partOf(INFO, steps, cells, camera, 700, 700) as Part;
+  const part = partOf(INFO, steps, cells, 4, camera, 700, 700) as Part;
   for (let row = cells.y; row < cells.y + cells.height; row += 3) {
     for (let column = cells.x; column < cells.x + cells.width; column += 3) {
       const seen = pointAt(INFO, { u: (column + 0.5) / INFO.width, v: (row + 0.5) / INFO.height }, 50).project(camera);
@@ -196,10 +196,10 @@ test('the part of the picture that shows cells holds all of them, and little els
     }
   }
   assert.ok(part.right - part.left < 110 && part.bottom - part.top < 130, JSON.stringify(part));
-  assert.equal(partOf(INFO, new Uint16Array(steps.length), cells, camera, 700, 700), null);
+  assert.equal(partOf(INFO, new Uint16Array(steps.length), cells, 4, camera, 700, 700), null);
   camera.position.set(-40, 0, 0);
   camera.updateMatrixWorld();
-  assert.equal(partOf(INFO, steps, cells, camera, 700, 700), 'all', 'some of it is behind the camera');
+  assert.equal(partOf(INFO, steps, cells, 4, camera, 700, 700), 'all', 'some of it is behind the camera');
   assert.deepEqual(joined({ left: 0, top: 5, right: 2, bottom: 6 }, { left: 1, top: 1, right: 9, bottom: 2 }), { left: 0, top: 1, right: 9, bottom: 6 });
   assert.deepEqual(within({ left: -3, top: 1.5, right: 9.2, bottom: 99 }, 50, 60), { left: 0, top: 1, right: 10, bottom: 60 });
   assert.equal(within({ left: 60, top: 0, right: 70, bottom: 9 }, 50, 60), null);

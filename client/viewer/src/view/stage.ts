@@ -3,6 +3,7 @@
 import { PerspectiveCamera, Scene, Vector3, WebGLRenderer } from 'three';
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
 import type { Snapshot } from '../link.ts';
+import { RANGE } from '../protocol/lattice.ts';
 import type { Channel } from '../protocol/lattice.ts';
 import type { Changed } from '../protocol/model.ts';
 import { FACING_RAD } from '../facing.ts';
@@ -135,7 +136,7 @@ export class Stage {
   patch(channel: Channel, changed: Changed[], level: Uint8Array): void {
     const before = this.partOf(channel, changed);
     this.surface?.patch(channel, changed, level);
-    const after = this.partOf(channel, changed);
+    const after = channel === RANGE ? this.partOf(channel, changed) : before; // colour moves nothing
     this.draw(before === 'all' || after === 'all' ? 'all' : joined(before, after));
   }
 

@@ -152,7 +152,8 @@ export class Surface {
     let part: Part | null = null;
     for (const rectangle of changed) {
       const cells = channel === RANGE ? grown(rectangle, NORMALS_REACH) : this.cellsOf(rectangle);
-      const seen = partOf(this.info, this.steps, grown(cells, 2 * this.tiles.coarsest(grown(cells, STRIDES.at(-1)!))), camera, width, height);
+      const [finest, coarsest] = this.tiles.strides(grown(cells, 2 * STRIDES.at(-1)!));
+      const seen = partOf(this.info, this.steps, grown(cells, 2 * coarsest), finest, camera, width, height);
       if (seen === 'all') return seen;
       part = joined(part, seen);
     }

@@ -120,15 +120,16 @@ export class Tiles {
     return batches;
   }
 
-  /** The coarsest stride of tiles that these cells touch. */
-  coarsest({ x, y, width, height }: { x: number; y: number; width: number; height: number }): number {
-    let most = 1;
+  /** The finest and the coarsest stride of tiles drawn that these cells touch; [1, 1] where none is. */
+  strides({ x, y, width, height }: { x: number; y: number; width: number; height: number }): [number, number] {
+    const drawn: number[] = [];
     for (let row = Math.max(0, Math.floor(y / this.side)); row < Math.min(this.down, Math.ceil((y + height) / this.side)); row++) {
       for (let column = Math.floor(x / this.side); column < Math.ceil((x + width) / this.side); column++) {
-        most = Math.max(most, this.stride[row * this.across + ((column % this.across) + this.across) % this.across]!);
+        const stride = this.stride[row * this.across + ((column % this.across) + this.across) % this.across]!;
+        if (stride) drawn.push(stride);
       }
     }
-    return most;
+    return drawn.length ? [Math.min(...drawn), Math.max(...drawn)] : [1, 1];
   }
 
   private look(camera: PerspectiveCamera): void {
