@@ -195,7 +195,7 @@ test('the part of the picture that shows cells holds all of them, and little els
       assert.ok(x > part.left && x < part.right && y > part.top && y < part.bottom);
     }
   }
-  assert.ok(part.right - part.left < 110 && part.bottom - part.top < 130, JSON.stringify(part));
+  assert.ok(part.right - part.left < 125 && part.bottom - part.top < 140, JSON.stringify(part));
   assert.equal(partOf(INFO, new Uint16Array(steps.length), cells, 4, camera, 700, 700), null);
   camera.position.set(-40, 0, 0);
   camera.updateMatrixWorld();
