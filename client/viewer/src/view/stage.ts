@@ -69,6 +69,9 @@ export class Stage {
   private readonly warming = new Set<Geometry>();
   private shading: Shading = 'lit';
   private overlay: Channel | null = null;
+  /** Of the picture, in CSS px: asking the canvas would have the browser lay the page out each time. */
+  private width = 1;
+  private height = 1;
   private asked = false;
   /** What is to be drawn anew. */
   private due: Part | 'all' | null = 'all';
@@ -143,7 +146,7 @@ export class Stage {
   /** The part of the picture that shows these samples; where a graphics card draws, all is as soon drawn. */
   private partOf(channel: Channel, changed: Changed[]): Part | 'all' | null {
     if (!this.surface || !this.software) return 'all';
-    return this.surface.seenAt(channel, changed, this.camera, this.canvas.clientWidth, this.canvas.clientHeight);
+    return this.surface.seenAt(channel, changed, this.camera, this.width, this.height);
   }
 
   /** Show a newer picture of a running sweep. */
@@ -303,7 +306,7 @@ export class Stage {
     this.camera.updateProjectionMatrix();
     this.camera.updateMatrixWorld();
     const ratio = this.renderer.getPixelRatio();
-    const isOther = this.surface?.choose(this.camera, this.canvas.clientHeight * ratio, detail) ?? true;
+    const isOther = this.surface?.choose(this.camera, this.height * ratio, detail) ?? true;
     const triangles = this.drawPart(isOther || this.isHasty || wasHasty ? 'all' : this.due);
     this.due = null;
     clearTimeout(this.leisure);
@@ -316,7 +319,7 @@ export class Stage {
 
   /** Draw, or draw a part anew. Returns how many triangles. */
   private drawPart(due: Part | 'all'): number {
-    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const { width, height } = this;
     const part = due === 'all' ? null : inside(due, width, height);
     if (due !== 'all' && !part) return 0;
     const camera = part ? this.camera.clone() : this.camera;
@@ -358,9 +361,10 @@ export class Stage {
 
   private resize(): void {
     const { clientWidth, clientHeight } = this.canvas.parentElement!;
+    [this.width, this.height] = [Math.max(1, clientWidth), Math.max(1, clientHeight)];
     this.renderer.setPixelRatio(this.software ? 1 : Math.min(Math.max(window.devicePixelRatio, SMOOTH_RATIO), 2));
-    this.renderer.setSize(Math.max(1, clientWidth), Math.max(1, clientHeight), false);
-    this.camera.aspect = Math.max(1, clientWidth) / Math.max(1, clientHeight);
+    this.renderer.setSize(this.width, this.height, false);
+    this.camera.aspect = this.width / this.height;
     if (this.isFramed) this.frame();
     this.draw();
   }
