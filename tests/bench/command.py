@@ -28,7 +28,7 @@ def run_bench(args: argparse.Namespace) -> int:
     record = {"bench": args.name, "conditions": conditions(), "skipped": skipped, **record}
     lines = [told, "", *(f"skipped: {reason}" for reason in skipped), _where(record["conditions"])]
     print(json.dumps(record) if args.json else "\n".join(lines), flush=True)
-    return 0
+    return 0 if record.get("ok", True) else 1
 
 
 def _scans(args: argparse.Namespace) -> tuple[list[BenchScan], list[str]]:

@@ -18,6 +18,7 @@ from tests.fuzz.ports import PORTS, attack
 ROOT = Path(__file__).parents[2]
 GROWN_MB_MAX = 20.0
 TAIL = 2000
+START_S, EACH_S = 600.0, 0.05  # what a target, and a message to it, may take on a machine with other work
 
 
 def run(names: Sequence[str], count: int, first: int) -> dict[str, Any]:
@@ -27,14 +28,23 @@ def run(names: Sequence[str], count: int, first: int) -> dict[str, Any]:
     for name in names:
         if name not in known:
             raise ConfigError(f"bench: no target {name!r}; there are {', '.join(known)}")
-    rows = [_apart(name, count, first) for name in names or known]
+    rows = []
+    for name in names or known:
+        rows.append(_apart(name, count, first))
+        print(_line(rows[-1]), file=sys.stderr, flush=True)
     return {"count": count, "seed": first, "rows": rows, "ok": all(row["ok"] for row in rows)}
 
 
 def _apart(name: str, count: int, first: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "tests.fuzz.campaign", name, str(count), str(first)]
     began_s = time.monotonic()
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=ROOT)
+    patience_s = START_S + count * EACH_S
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", cwd=ROOT, timeout=patience_s, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return {"target": name, "seconds": patience_s, "ok": False, "found": "did not come to an end"}
     row = {"target": name, "seconds": time.monotonic() - began_s}
     if done.returncode:
         return {**row, "ok": False, "found": f"status {done.returncode}: {done.stderr[-TAIL:]}"}
@@ -54,16 +64,19 @@ def one(name: str, count: int, first: int) -> dict[str, Any]:
 
 
 def told(record: dict[str, Any]) -> str:
-    """A line for each target, and below it what was found."""
-    lines = []
-    for row in record["rows"]:
-        port = ""
-        if "grown_mb" in row:
-            port = f", {row['served']} others served meanwhile, memory {row['grown_mb']:+.1f} MB"
-        lines.append(f"{'ok' if row['ok'] else 'FOUND':6} {row['target']:20} {row['seconds']:.0f} s{port}")
-        if not row["ok"]:
-            lines.append(f"{'':7}{row['found']}")
-    return "\n".join(lines)
+    """The verdict; a line for each target has been printed already."""
+    bad = [row["target"] for row in record["rows"] if not row["ok"]]
+    verdict = f"found something in {', '.join(bad)}" if bad else "nothing found"
+    return f"{record['count']} messages each to {len(record['rows'])} targets, seed {record['seed']}: {verdict}"
+
+
+def _line(row: dict[str, Any]) -> str:
+    """What a target did, and below it what was found."""
+    port = ""
+    if "grown_mb" in row:
+        port = f", {row['messages']} messages, others served {row['served']} times, memory {row['grown_mb']:+.1f} MB"
+    found = "" if row["ok"] else f"\n{'':7}{row['found']}"
+    return f"{'ok' if row['ok'] else 'FOUND':6} {row['target']:20} {row['seconds']:.0f} s{port}{found}"
 
 
 if __name__ == "__main__":
