@@ -66,7 +66,7 @@ def reply(status: int, body: bytes) -> Any:
     """The JSON of an answer. Raises RequestRefused for a refusal, RemoteWireError for anything that is no JSON."""
     try:
         said = msgspec.json.decode(body)
-    except (msgspec.DecodeError, UnicodeError) as problem:
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as problem:
         raise RemoteWireError(f"HTTP {status} without a JSON body: {problem}") from None
     if status >= 400:
         error = said if isinstance(said, dict) else {}

@@ -372,7 +372,7 @@ def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:
         return "node" if isinstance(answer, dict) and "status" in answer else "other"
     except OSError as error:
         return "other" if error.errno is None or error.errno == errno.ECONNRESET else "nobody"
-    except (http.client.HTTPException, msgspec.DecodeError, UnicodeError):
+    except (http.client.HTTPException, ValueError, RecursionError):
         return "other"
     finally:
         line.close()

@@ -20,6 +20,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Annotated, Any
 
 import msgspec
@@ -148,20 +149,20 @@ def read_grid(folder: Path, spec: GridSpec) -> Grid:
     try:
         range_steps, texture = (_mapped(folder / name) for name in (RANGE_FILE, TEXTURE_FILE))
         return Grid(spec, range_steps, texture, _read_repairs(folder / REPAIRS_FILE))
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, OverflowError, TokenError) as error:  # numpy parses headers as Python
         raise LibraryError(f"its samples cannot be read: {error}") from error
 
 
 def _mapped(path: Path) -> NDArray[Any]:
     """An array in a file, read-only; as a plain array, since each part taken of a memmap costs a memmap's making.
 
-    Raises OSError, ValueError, EOFError.
+    Raises what `read_grid` translates.
     """
     return np.asarray(open_memmap(path, mode="r"))
 
 
 def _read_repairs(path: Path) -> RepairArray:
-    """Raises OSError, ValueError, EOFError."""
+    """Raises what `read_grid` translates."""
     if not path.exists():
         return no_repairs()
     repairs: RepairArray = open_memmap(path, mode="r")

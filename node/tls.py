@@ -14,6 +14,7 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import CertificateIssuerPrivateKeyTypes
@@ -151,7 +152,7 @@ def _read_key(path: Path) -> CertificateIssuerPrivateKeyTypes:
         key = serialization.load_pem_private_key(read_bounded(path, FILE_BYTES_MAX), None)
     except OSError as error:
         raise AccessError(f"{path}: {error.strerror}") from error
-    except (ValueError, TypeError, LibraryError) as error:
+    except (ValueError, TypeError, UnsupportedAlgorithm, LibraryError) as error:
         raise AccessError(f"{path} holds no key: {error}; remove it, and pair everybody anew") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise AccessError(f"{path} holds a key that this node did not make; remove it, or set server.certificate")

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import ConfigError
-from tests.fuzz.parsers import fuzz, targets
+from tests.fuzz.parsers import targets
 from tests.fuzz.ports import PORTS, attack
+from tests.fuzz.target import fuzz
 
 ROOT = Path(__file__).parents[2]
 GROWN_MB_MAX = 20.0

@@ -10,6 +10,8 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from typing import Protocol
 
+import aiohttp
+
 from node.auth import COOKIE, SUBPROTOCOL
 from protocol import messages as m
 from tests.fuzz.mutation import mutant
@@ -51,6 +53,17 @@ class Campaign(Protocol):
 Exchange = Callable[[asyncio.StreamReader, asyncio.StreamWriter], AsyncIterator[None]]
 
 
+async def ask_everything(url: str, token: str) -> None:
+    """Everything that attackers ask, once and soundly, so that what it leads to is no growth later."""
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    asked = [("GET", path, b"") for path in PATHS if path != "/v1/stream"]
+    asked += [(method, path, body) for method in ("POST", "PATCH") for path in PATHS for body in BODIES]
+    async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(ssl=False), headers=headers) as http:
+        for method, path, body in asked:
+            async with http.request(method, url + path, data=body, allow_redirects=False) as answer:
+                await answer.read()
+
+
 async def attack_http(url: str, token: str, draw: random.Random, campaign: Campaign) -> None:
     """Requests one behind the other, until the node hangs up. token : of a login, mutated with all else."""
 
@@ -61,7 +74,10 @@ async def attack_http(url: str, token: str, draw: random.Random, campaign: Campa
             await writer.drain()
             with suppress(TimeoutError):  # an unfinished request earns no answer: go on, the next completes it
                 async with asyncio.timeout(HEAD_S):
-                    if not await reader.read(65536):
+                    answer = await reader.read(65536)
+                    if b"HTTP/1.1 500" in answer:
+                        campaign.failures.append(f"a request failed in the node: {answer[-300:]!r}")
+                    if not answer:
                         return
 
     await _attack(url, requests, campaign)

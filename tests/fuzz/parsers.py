@@ -6,17 +6,15 @@
 from __future__ import annotations
 
 import io
-import random
 import shutil
+import zipfile
 import zlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from client.model import Model
 from exchange.formats import ReadOptions, read_scan, writer_of
@@ -42,6 +40,7 @@ from protocol.codec import (
 )
 from protocol.errors import FoveascanError
 from protocol.framing import FrameReader, encode_frame
+from protocol.grid import StepArray
 from protocol.lattice import Channel
 from protocol.live import LiveColumns
 from protocol.refinement import CRC, Refinement
@@ -52,10 +51,10 @@ from protocol.session import Session
 from tests.client.scripted_node import Planner, synthetic_grid
 from tests.exchange.grids import vase
 from tests.exchange.test_echo import echo
-from tests.fuzz.mutation import mutant, mutants
+from tests.fuzz.kept import of_disks, of_hearsay
+from tests.fuzz.target import Target
 from tests.protocol.test_scanner_messages import SPEC, TABLE
 
-DRAWN = 2000
 SMALL = ReadOptions(size=(24, 12, 32, 16))
 SAID = (
     m.Hello(m.PROTOCOL, "x"), m.Open(1, "latest"), m.Look(2, 0.5, 0.5), m.Look(3, 0.1, 0.9, max_bytes=400, fill=True),
@@ -69,53 +68,6 @@ PAIRING = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Target:
-    """A parser. seeds : valid inputs.  parse : takes bytes, raises nothing but `may`."""
-
-    name: str
-    seeds: tuple[bytes, ...]
-    parse: Callable[[bytes], object]
-    may: tuple[type[Exception], ...] = (FoveascanError,)
-
-
-class Found(Exception):
-    """A parser raised what it may not, which is the cause."""
-
-
-def fuzz(target: Target, count: int, first: int = 0, drawn: int = DRAWN) -> None:
-    """So many inputs for a parser, the first of them drawn by hypothesis, which finds the smallest that fails.
-
-    The others come from a generator a hundred times as quick. Raises what the parser raised that it may not, or Found with the input.
-    """
-    _drawn(target, min(count, drawn), first)
-    draw = random.Random(first)
-    for _ in range(count - drawn):
-        data = mutant(target.seeds, draw)
-        try:
-            target.parse(data)
-        except target.may:
-            pass
-        except Exception as problem:
-            raise Found(f"{target.name}: {type(problem).__name__}: {problem}, of {data!r}") from problem
-
-
-def _drawn(target: Target, count: int, first: int) -> None:
-    @seed(first)
-    @settings(
-        max_examples=count, deadline=None, database=None, phases=(Phase.generate, Phase.shrink), print_blob=True,
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
-    @given(mutants(target.seeds))
-    def one(data: bytes) -> None:
-        try:
-            target.parse(data)
-        except target.may:
-            pass
-
-    one()
-
-
 def targets(folder: Path) -> Iterable[Target]:
     """All of them. folder : for those that read files."""
     yield from _of_the_link()
@@ -123,6 +75,8 @@ def targets(folder: Path) -> Iterable[Target]:
     yield from _of_codecs()
     yield from _of_files(folder)
     yield from _of_the_node(folder)
+    yield from of_disks(folder)
+    yield from of_hearsay()
 
 
 # -- the scanner's line ------------------------------------------------------------------------------------------------
@@ -226,6 +180,7 @@ def _of_files(folder: Path) -> Iterable[Target]:
         writer_of(suffix)(grid, file)
         yield Target(name, (file.getvalue(),), _FileOf(folder / f"fuzzed{suffix}"))
     yield Target("npz-upload", (_written(grid),), lambda data: read_native(io.BytesIO(data)))
+    yield Target("npz-array", (_npy_of(grid.range_steps),), _read_member)
     obj = b"mtllib m\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 1 1 1\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1 2 4\nf -1 -2 -3"
     yield Target("obj", (obj,), _FileOf(folder / "fuzzed.obj"))
     off = b"OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n"
@@ -237,6 +192,22 @@ def _written(grid: object) -> bytes:
     file = io.BytesIO()
     writer_of(".npz")(grid, file)  # type: ignore[arg-type]  # a grid, as its maker says
     return file.getvalue()
+
+
+def _npy_of(array: StepArray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def _read_member(data: bytes) -> None:
+    """In an archive whose checksums are right."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name in ("depth_u16", "texture", "z_min_mm", "name"):
+            archive.writestr(f"{name}.npy", data)
+    file.seek(0)
+    read_native(file)
 
 
 class _FileOf:

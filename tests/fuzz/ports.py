@@ -30,11 +30,11 @@ from simulators.carriers import PtyPort
 from simulators.usb_testbed import PRELOAD, UsbTestbed, is_available
 from tests.exchange.grids import vase
 from tests.fuzz.lying_scanner import HonestScanner, LyingScanner
-from tests.fuzz.network import attack_http, attack_stream
+from tests.fuzz.network import ask_everything, attack_http, attack_stream
 
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 ATTACKERS = 8
-WARM_UP = 20
+WARM_UP = 5
 FAILURES_MAX = 50
 SWEEP_S = 60.0  # until an honest scanner is found again, and its sweep a scan
 SETTINGS = """
@@ -175,9 +175,10 @@ async def _behave_and_sweep(target: Target) -> None:
 
 
 async def _warm_up(target: Target, hostility: Hostility) -> None:
-    """What the node keeps for everybody is there before its memory is looked at."""
+    """What the node keeps for everybody, and for as many as there will be, is there before its memory is looked at."""
     for _ in range(WARM_UP):
-        await _behave(target)
+        await asyncio.gather(*(_behave(target) for _ in range(ATTACKERS)))
+    await ask_everything(target.url, target.token)
     hostility.begin()
 
 

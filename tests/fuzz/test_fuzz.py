@@ -8,8 +8,9 @@ import pytest
 
 from simulators.usb_testbed import PRELOAD, is_available
 from tests.fuzz.campaign import GROWN_MB_MAX
-from tests.fuzz.parsers import Found, Target, fuzz, targets
+from tests.fuzz.parsers import targets
 from tests.fuzz.ports import PORTS, attack
+from tests.fuzz.target import Found, Target, fuzz
 
 INPUTS, MESSAGES = 60, 600
 
