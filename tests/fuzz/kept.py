@@ -1,4 +1,4 @@
-"""Parsers of what node and clients keep on disk, and of what they are told in passing: answers, headers, queries, names."""
+"""Parsers of what node and clients keep on disk, and of what they are told in passing: answers, headers, names."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ import msgspec
 import numpy as np
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
-from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 
 from client import credentials
 from client.discovery import _printable

@@ -31,7 +31,8 @@ class Found(Exception):
 def fuzz(target: Target, count: int, first: int = 0, drawn: int = DRAWN) -> None:
     """So many inputs for a parser, the first of them drawn by hypothesis, which finds the smallest that fails.
 
-    The others come from a generator a hundred times as quick. Raises what the parser raised that it may not, or Found with the input.
+    The others come from a generator a hundred times as quick. Raises what the parser raised that it may not, or Found
+    with the input.
     """
     _drawn(target, min(count, drawn), first)
     draw = random.Random(first)
