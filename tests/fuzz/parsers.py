@@ -9,13 +9,14 @@ import io
 import shutil
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from client.classic_model import ClassicModel
 from client.model import Model
 from exchange.formats import ReadOptions, read_scan, writer_of
 from exchange.native import read_native
@@ -42,17 +43,31 @@ from protocol.errors import FoveascanError
 from protocol.framing import FrameReader, encode_frame
 from protocol.grid import StepArray
 from protocol.lattice import Channel
-from protocol.live import LiveColumns
-from protocol.refinement import CRC, Refinement
+from protocol.live import LiveColumns, is_live
+from protocol.refinement import CRC, Generator, Refinement
 from protocol.scanner_link import Role, ScannerLink
-from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepHeader, decode_message, encode_message, is_known
+from protocol.scanner_messages import (
+    DeviceInfo,
+    RangeColumn,
+    SweepHeader,
+    TextureColumn,
+    decode_message,
+    encode_message,
+    is_known,
+)
 from protocol.session import Role as End
 from protocol.session import Session
+from protocol.sphere_fovea import Kind
+from protocol.sphere_fovea import SphereParameters as ClassicSphere
 from tests.client.scripted_node import Planner, synthetic_grid
+from tests.client.test_classic_model import INFO as CLASSIC
+from tests.client.test_classic_model import first_view, range_fovea, texture_fovea
+from tests.client.test_sphere_model import STEPS
 from tests.exchange.grids import vase
 from tests.exchange.test_echo import echo
 from tests.fuzz.kept import of_disks, of_hearsay
 from tests.fuzz.target import Target
+from tests.golden.write_sphere import RANGE, TEXTURE
 from tests.protocol.test_scanner_messages import SPEC, TABLE
 
 SMALL = ReadOptions(size=(24, 12, 32, 16))
@@ -62,7 +77,16 @@ SAID = (
     m.Watch(True), m.Published("0" * 32), m.Goodbye("bye"), m.Refused(1, "busy", "x"),
     m.Updated(1, 2, "complete", 0.1),
 )  # fmt: skip
-SETTINGS = b'[capture]\nscanner = "usb:1209:5ca1"\nbaud = 9600\n[server]\nlisten = "[::1]:7"\n[log]\nlevel = "error"\n'
+SETTINGS = b"""
+[capture]
+scanner = "usb:1209:5ca1"
+baud = 9600
+[server]
+listen = "[::1]:7"
+trusted_proxies = ["::1"]
+[log]
+level = "error"
+"""
 PAIRING = (
     msgspec.json.encode(pairing.PairRequest("01" * 16, "ab" * 32)), b"ABCD-EFGH-IJKL-MNOP",
 )  # fmt: skip
@@ -100,7 +124,9 @@ def _read_frames(data: bytes) -> None:
 
 def _decode_scanner(data: bytes) -> None:
     if data and is_known(data[0]):  # as the link does
-        decode_message(data[0], data[1:])
+        said = decode_message(data[0], data[1:])
+        if isinstance(said, RangeColumn | TextureColumn):
+            _ = said.samples
 
 
 def _through_link(data: bytes) -> None:
@@ -125,11 +151,23 @@ def _of_the_stream() -> Iterable[Target]:
     yield Target("control-messages", tuple(m.encode_message(said).encode() for said in SAID), m.decode_message)
     yield Target("session", tuple(m.encode_message(said).encode() for said in SAID), _to_a_node)
     planner = Planner(synthetic_grid())
-    wire = tuple(refinement.to_bytes() for refinement in planner.first_view())
-    yield Target("refinement", wire, Refinement.from_bytes)
-    yield Target("model", wire, _ModelOf(planner))
-    columns = LiveColumns(Channel.RANGE, 1, (4, 5), 3, bytes(12)).to_bytes()
-    yield Target("live-columns", (columns,), LiveColumns.from_bytes)
+    first = planner.first_view()
+    foveae = (planner.range_fovea(), planner.texture_fovea())
+    yield Target("model", tuple(one.to_bytes() for one in (*first, *foveae)), _ModelOf(planner.info, first))
+    classic = (*first_view(), range_fovea(), texture_fovea())
+    yield Target("classic-model", tuple(one.to_bytes() for one in classic), _ModelOf(CLASSIC, classic[:2]))
+    strips = tuple(bytes.fromhex(step["refinement"]) for step in STEPS if step["refinement"])
+    yield Target("sphere-model", strips, _ModelOf(*_sphere()))
+    classic_sphere = ClassicSphere(1, Kind.RINGS, 1 << 30, 0, 0.5, 0.1, rho=4)
+    seen = Refinement(
+        Generator.SPHERE, Channel.RANGE, 1, 2, 1, RangeCodec.RAW, 1, 4, bytes(8), parameters=classic_sphere
+    )
+    every = (*first, *foveae, *classic, seen)
+    yield Target("refinement", (*(one.to_bytes() for one in every), *strips), _to_a_client)
+    columns = (
+        LiveColumns(Channel.RANGE, 1, (4, 5), 3, bytes(12)), LiveColumns(Channel.TEXTURE, 1, (4, 5), 3, bytes(18))
+    )
+    yield Target("live-columns", tuple(one.to_bytes() for one in columns), _to_a_client)
 
 
 def _to_a_node(data: bytes) -> None:
@@ -140,15 +178,48 @@ def _to_a_node(data: bytes) -> None:
     node.receive(data.decode(errors="surrogateescape"))
 
 
-class _ModelOf:
-    """Applies refinements whose checksum was made right, so that what is wrong is what they say."""
+def _to_a_client(data: bytes) -> None:
+    """Binary messages whose checksum was made right, as a client reads them."""
+    client = Session(End.CLIENT)
+    client.receive(m.encode_message(m.ServerInfo(m.PROTOCOL, "n", "n", "0")))
+    client.send(m.Hello(m.PROTOCOL, "x"))
+    client.receive(m.encode_message(m.Welcome("view")))
+    said = client.receive(data if is_live(data) else _checked(data))
+    if isinstance(said, LiveColumns):
+        _ = said.samples
 
-    def __init__(self, planner: Planner) -> None:
-        self._info = planner.info
+
+def _checked(data: bytes) -> bytes:
+    whole = data[: -CRC.size]
+    return whole + CRC.pack(zlib.crc32(whole))
+
+
+class _ModelOf:
+    """Applies refinements to a first view. Their checksum was made right, so what is wrong is what they say."""
+
+    def __init__(self, info: m.ScanInfo, first: Sequence[Refinement]) -> None:
+        self._info = info
+        self._first = first
 
     def __call__(self, data: bytes) -> None:
-        whole = data[: -CRC.size]
-        Model(self._info).apply(Refinement.from_bytes(whole + CRC.pack(zlib.crc32(whole))))
+        refinement = Refinement.from_bytes(_checked(data))
+        model = ClassicModel(self._info) if self._info.profile == "classic" else Model(self._info)
+        if refinement.generator is not Generator.COARSE:
+            for one in self._first:
+                model.apply(one)
+        model.apply(refinement)
+
+
+def _sphere() -> tuple[m.ScanInfo, Sequence[Refinement]]:
+    """As the golden vectors begin."""
+    coarse = RANGE.coarse_width, RANGE.coarse_height, TEXTURE.coarse_width, TEXTURE.coarse_height
+    info = m.ScanInfo("golden", 64, 136, 64, 136, *coarse, 0.01, 1.0, 0.0, 0.0, geometry="sphere")
+    steps = encode_range(np.ones((17, 8), np.uint16), RangeCodec.RAW)
+    texels = encode_texture(np.zeros((17, 8, 3), np.uint8), TextureCodec.HTJ2K, 255)
+    return info, (
+        Refinement(Generator.COARSE, Channel.RANGE, 1, 0, 0, RangeCodec.RAW, 1, 136, steps),
+        Refinement(Generator.COARSE, Channel.TEXTURE, 1, 1, 0, TextureCodec.HTJ2K, 255, 136, texels),
+    )
 
 
 # -- payloads ----------------------------------------------------------------------------------------------------------
@@ -231,14 +302,18 @@ def _of_the_node(folder: Path) -> Iterable[Target]:
         settings_file.write_bytes(data)
         load_config(settings_file)
 
-    yield Target("config", (SETTINGS, (Path(__file__).parents[2] / "systemd/node.toml").read_bytes()), read_settings)
+    ours = (Path(__file__).parents[2] / "systemd/node.toml").read_bytes()
+    yield Target("config", (SETTINGS, b"[log]\nunknown = 1", ours), read_settings)
     yield Target("pairing", PAIRING, _pair, (FoveascanError, msgspec.DecodeError, UnicodeError))
     yield Target("sidecar-changes", (b'{"name":"x","notes":"y"}',), decode_changes, (ValueError,))
     header = next(message for message, _ in TABLE if isinstance(message, SweepHeader))
     opening = encode_record(encode_opening(DeviceInfo("A7", 5, 1000, 100), header, 1.0))
     column = encode_record(encode_entry(RangeColumn(7, 0, 1, 0, 1, 1, bytes(2 * SPEC.height))))
     yield Target("journal", (opening + column * 3,), lambda data: survey_journal("0" * 16, data))
-    yield Target("access", (b'{"format":1,"tokens":[],"codes":[]}',), _AccessOf(folder))
+    who = b'"name":"x","role":"view"'
+    token = b'{%s,"digest":"%s","created_unix_s":1}' % (who, b"ab" * 32)
+    code = b'{%s,"key":"%s","expires_unix_s":9e9}' % (who, b"cd" * 32)
+    yield Target("access", (b'{"format":1,"tokens":[%s],"codes":[%s]}' % (token, code),), _AccessOf(folder))
     yield Target("backup", (_backup(folder),), _RestoreOf(folder))
 
 
@@ -258,7 +333,7 @@ class _AccessOf:
 
     def __call__(self, data: bytes) -> None:
         (self._folder / "access.json").write_bytes(data)
-        Access(self._folder).tokens()
+        Access(self._folder).redeem(lambda key: False, 1.0)
 
 
 def _backup(folder: Path) -> bytes:
