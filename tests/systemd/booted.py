@@ -6,6 +6,7 @@ machine's. It needs root, overlayfs and control groups of version 2.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -15,12 +16,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
 SITE = Path(sys.prefix) / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
 SYSTEMD = "/lib/systemd/systemd"
 BOOT_S, RUN_S = 20, 240
 PYTHON = "/opt/python" if sys.base_prefix.startswith(("/root/", "/home/")) else sys.base_prefix
+FOVEASCAN = (f"{PYTHON}/bin/python{sys.version_info.major}.{sys.version_info.minor}", "-P", "-m", "foveascan")
 TARGETS = "sysinit basic shutdown network-online multi-user booted"
 
 BOOT = r"""
@@ -44,7 +47,7 @@ mount -t tmpfs tmpfs dev/shm; ln -s /proc/self/fd dev/fd
 mount -t tmpfs -o mode=755 tmpfs run; mount -t tmpfs -o mode=1777 tmpfs tmp
 mkdir -p run/units etc/systemd/system/foveascan.service.d
 for name in $TARGETS; do printf '[Unit]\nDefaultDependencies=no\n' > run/units/$name.target; done
-cp /lib/systemd/system/{-.slice,system.slice,init.scope} run/units/ 2> /dev/null || true
+cp /lib/systemd/system/{-.slice,system.slice,init.scope,systemd-journald{.service,.socket}} run/units/ 2> /dev/null || true
 cat > etc/systemd/system/foveascan.service.d/test.conf <<END
 [Service]
 Environment=LD_LIBRARY_PATH=$PYTHON/lib
@@ -68,20 +71,32 @@ class Machine:
 
     def run(self, *command: str, sources: str = "/opt/src", check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run a command there, as root."""
-        enter = ["nsenter", "-t", str(self.pid), "--mount", "--pid", "--ipc", "--uts", "--cgroup", "--wd=/"]
-        environ = {
-            "PATH": os.environ["PATH"], "PYTHONPATH": f"{sources}:/opt/site", "LD_LIBRARY_PATH": f"{PYTHON}/lib",
-            "HOME": "/run", "PYTHONDONTWRITEBYTECODE": "1",
-        }  # fmt: skip
-        done = subprocess.run([*enter, *command], env=environ, capture_output=True, text=True, timeout=RUN_S)
+        done = subprocess.run(
+            [*self._enter, *command], env=_environ(sources), capture_output=True, text=True, timeout=RUN_S, check=False
+        )
         assert not check or done.returncode == 0, done.stdout + done.stderr
         return done
 
     def foveascan(self, *command: str, sources: str = "/opt/src", check: bool = True) -> str:
         """Run our command from a checkout there; what it said."""
-        python = f"{PYTHON}/bin/python{sys.version_info.major}.{sys.version_info.minor}"
-        done = self.run(python, "-P", "-m", "foveascan", *command, sources=sources, check=check)
+        done = self.run(*FOVEASCAN, *command, sources=sources, check=check)
         return done.stdout + done.stderr
+
+    @contextmanager
+    def started(self, *command: str) -> Iterator[dict[str, Any]]:
+        """Our command, with --json, beside everything else there; what it says once it is ready."""
+        with subprocess.Popen(
+            [*self._enter, *FOVEASCAN, *command], env=_environ("/opt/src"), stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            try:
+                yield json.loads(process.stdout.readline())
+            finally:
+                process.terminate()
+
+    @property
+    def _enter(self) -> list[str]:
+        return ["nsenter", "-t", str(self.pid), "--mount", "--pid", "--ipc", "--uts", "--cgroup", "--wd=/"]
 
     def show(self, key: str) -> str:
         """A property of the service."""
@@ -101,6 +116,13 @@ class Machine:
     def write(self, path: str, text: str) -> None:
         """Make a file there."""
         self.run("sh", "-c", 'mkdir -p "$(dirname "$0")"; printf %s "$1" > "$0"', path, text)
+
+
+def _environ(sources: str) -> dict[str, str]:
+    return {
+        "PATH": os.environ["PATH"], "PYTHONPATH": f"{sources}:/opt/site", "LD_LIBRARY_PATH": f"{PYTHON}/lib",
+        "HOME": "/run", "PYTHONDONTWRITEBYTECODE": "1",
+    }  # fmt: skip
 
 
 @contextmanager

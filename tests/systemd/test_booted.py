@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
 import time
@@ -11,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.systemd.booted import Machine, booted, why_not
+from simulators.usb_testbed import PRELOAD, is_available
+from tests.systemd.booted import ROOT, Machine, booted, why_not
 
 WHY_NOT = why_not()
 pytestmark = [pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT), pytest.mark.timeout(300)]
@@ -75,6 +77,94 @@ def test_pairing_and_the_doctor_find_it(machine: Machine, port: int) -> None:
     assert machine.foveascan("scans", "--node", f"https://127.0.0.1:{port}", "--json") == ""
     doctor = machine.foveascan("doctor", "--config", SETTINGS, check=False)
     assert f"a node answers at 127.0.0.1:{port}" in doctor
+
+
+def sweep(machine: Machine, port: int, scanner: str) -> None:
+    """Set the scanner, wait until the node has it, and sweep to the end."""
+    machine.write(SETTINGS, settings(port) + f'[capture]\nscanner = "{scanner}"\n')
+    machine.run("systemctl", "restart", "foveascan")
+    until = time.monotonic() + 60
+    while "scanner: ready" not in machine.show("StatusText"):
+        assert time.monotonic() < until, machine.show("StatusText") + machine.log()
+        time.sleep(0.1)
+    said = machine.foveascan("scan", "--node", f"https://127.0.0.1:{port}", check=False)
+    assert "coverage" in said, said + machine.log()
+
+
+def test_a_scanner_on_a_tty_is_swept_with_behind_every_restriction(machine: Machine, port: int) -> None:
+    with machine.started("simulate", "--path", "/run/tty", "--specimen", "sphere", "--json") as ready:
+        machine.run("sh", "-c", f"chown foveascan $(readlink -f {ready['path']})")  # as udev's rule does
+        sweep(machine, port, ready["path"])
+    assert len(scans(machine, port)) == 1
+
+
+@pytest.mark.skipif(not is_available() and "CI" not in os.environ, reason=f"needs {PRELOAD}")
+def test_a_scanner_on_usb_is_swept_with_behind_every_restriction(machine: Machine, port: int) -> None:
+    drop_in = "/etc/systemd/system/foveascan.service.d/usb.conf"
+    with machine.started("simulate", "--link", "usb", "--path", "/run/usb", "--specimen", "sphere", "--json") as ready:
+        machine.run("chown", "-R", "foveascan", "/run/usb")
+        variables = " ".join(f"{name}={value}" for name, value in ready["environment"].items())
+        machine.write(drop_in, f"[Service]\nEnvironment={variables}\n")
+        machine.run("systemctl", "daemon-reload")
+        sweep(machine, port, ready["path"])
+    machine.run("rm", drop_in)
+    machine.run("systemctl", "daemon-reload")
+    assert len(scans(machine, port)) == 1  # the same sphere, so the same scan
+
+
+def test_the_journal_has_what_it_says_with_priorities(machine: Machine, port: int) -> None:
+    drop_in = "/etc/systemd/system/foveascan.service.d/test.conf"
+    before = machine.run("cat", drop_in).stdout
+    machine.write(drop_in, re.sub("^Standard(Error|Output)=.*$", r"Standard\1=journal", before, flags=re.MULTILINE))
+    machine.run("systemctl", "start", "systemd-journald.socket", "systemd-journald.service")
+    machine.write(SETTINGS, settings(port))
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "restart", "foveascan")
+    machine.foveascan("join", "ABCD-EFGH-IJKL-MNOP", "--node", f"https://127.0.0.1:{port}", check=False)
+    told: dict[str, int] = {}
+    until = time.monotonic() + 30
+    while not any("wrong code" in message for message in told):
+        assert time.monotonic() < until, told
+        time.sleep(0.1)
+        said = machine.run("journalctl", "-u", "foveascan", "-o", "json", "--no-pager").stdout
+        lines = [json.loads(line) for line in said.splitlines()]
+        told = {str(line["MESSAGE"]): int(line["PRIORITY"]) for line in lines}
+    machine.write(drop_in, before)
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "restart", "foveascan")
+    [wrong], [own] = ([p for text, p in told.items() if words in text] for words in ("a wrong code", "certificate: SHA"))
+    assert (wrong, own) == (4, 6)
+
+
+def test_scans_settings_and_logins_come_back_by_the_commands_of_the_readme(machine: Machine, port: int) -> None:
+    before = scans(machine, port)
+    machine.run("mkdir", "-p", "/srv")
+    for command in readme("Back up"):
+        machine.run("sh", "-c", command)
+    machine.foveascan("install-service", "--remove", "--purge")
+    machine.write(SETTINGS, settings(port))
+    machine.foveascan("install-service")
+    assert machine.foveascan("scans", "--node", f"https://127.0.0.1:{port}", check=False).startswith("foveascan: ")
+    for command in readme("Restore"):
+        machine.run("sh", "-c", command)
+    machine.await_property("ActiveState", "active")
+    assert len(before) == 1 and scans(machine, port) == before
+    for path in ("/var/lib/foveascan/access/access.json", f"/var/lib/foveascan/{before[0]}/scan.json"):
+        assert machine.run("stat", "-c", "%U", path).stdout.strip() == "foveascan"
+
+
+def readme(step: str) -> list[str]:
+    """The commands of a step of README's "As a service", for root."""
+    text = (ROOT / "README.md").read_text().partition(f"\n**{step}.** ")[2].partition("\n**")[0]
+    commands = [line.strip().replace("sudo ", "") for line in text.splitlines() if line.startswith("    ")]
+    assert commands
+    return commands
+
+
+def scans(machine: Machine, port: int) -> list[str]:
+    """The ids of the node's scans, for whoever was paired."""
+    said = machine.foveascan("scans", "--node", f"https://127.0.0.1:{port}", "--json")
+    return [json.loads(line)["id"] for line in said.splitlines()]
 
 
 def test_a_reload_takes_sound_settings_and_refuses_others(machine: Machine, port: int) -> None:
