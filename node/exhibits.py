@@ -9,7 +9,7 @@ import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Literal, TypeVar, overload
 
 from node.classic import ClassicView, build_classic_view
@@ -195,4 +195,5 @@ def _done(model: Future[T]) -> T | None:
 
 def _give_way() -> None:
     """Have the thread that calls this run where others need not."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVES_WAY)
+    with suppress(OSError):  # a sandbox may forbid even that
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), GIVES_WAY)
