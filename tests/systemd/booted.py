@@ -47,7 +47,8 @@ mount -t tmpfs tmpfs dev/shm; ln -s /proc/self/fd dev/fd
 mount -t tmpfs -o mode=755 tmpfs run; mount -t tmpfs -o mode=1777 tmpfs tmp
 mkdir -p run/units etc/systemd/system/foveascan.service.d
 for name in $TARGETS; do printf '[Unit]\nDefaultDependencies=no\n' > run/units/$name.target; done
-cp /lib/systemd/system/{-.slice,system.slice,init.scope,systemd-journald{.service,.socket}} run/units/ 2> /dev/null || true
+units="-.slice system.slice init.scope systemd-journald.service systemd-journald.socket"
+for unit in $units; do cp /lib/systemd/system/$unit run/units/ 2> /dev/null || true; done
 cat > etc/systemd/system/foveascan.service.d/test.conf <<END
 [Service]
 Environment=LD_LIBRARY_PATH=$PYTHON/lib
