@@ -105,6 +105,7 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     connections: Annotated[int, Meta(ge=32, le=65536)] = 512  # of all together, streams among them
     connections_per_address: Annotated[int, Meta(ge=1, le=65536)] = 256
     requests_per_address: Annotated[int, Meta(ge=1, le=4096)] = 64  # in work at once, streams apart
+    streams_per_address: Annotated[int, Meta(ge=1, le=4096)] = 32  # so that one does not take all of max_clients
     requests_s_per_address: Annotated[float, Meta(ge=1, le=1e5)] = 500.0  # [1/s], and twice as many at once
     messages_s: Annotated[float, Meta(ge=1, le=1e5)] = 200.0  # [1/s] on one stream, and twice as many at once
     head_s: Annotated[float, Meta(ge=1, le=600)] = 30.0  # [s] a handshake may take, and then the first request's head

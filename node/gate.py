@@ -2,6 +2,7 @@
 
     before the first request    more connections than there may be are closed; handshake and head take head_s at most
     a request                   its address has so many in work and so many a second, a small body takes body_s at most
+    a stream                    its address has so many
     afterwards                  who does not take what we send for stall_s is cut off; idle connections last keep_s
 
 Near a limit, connections are still answered, 429 or 503 with Retry-After, and closed then. Behind a proxy that the
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 SURPLUS = 16  # connections above a limit that are told so
 BACKLOG = 128
 SWEEP_S = 1.0
+STREAM_S = 10.0  # after which somebody may have closed one
 READ_BYTES = 1 << 15  # what one connection may have us hold of what it sends
 FILES_BESIDE = 128  # descriptors for all that is no connection
 UPLOADS = frozenset({("POST", "/v1/scans")})  # these look after their bodies themselves
@@ -76,6 +78,7 @@ class Gate:
         self._most = limits.connections
         self._by_place: Counter[str] = Counter()
         self._in_work: Counter[str] = Counter()
+        self._streams: Counter[str] = Counter()
         self._rates = Buckets(limits.requests_s_per_address)
         self._tasks: set[asyncio.Task[None]] = set()
         self._listeners: list[socket.socket] = []
@@ -149,18 +152,19 @@ class Gate:
             return
         if wait_s := self._rates.take(place, time.monotonic()):
             raise web.HTTPTooManyRequests(text="too many requests from there: wait a moment", headers=_after(wait_s))
+        limits = self._limits
+        in_work, most, name, wait_s = self._in_work, limits.requests_per_address, "requests", 1.0
         if is_stream:
-            yield
-            return
-        if self._in_work[place] >= self._limits.requests_per_address:
-            raise web.HTTPTooManyRequests(text="too many requests from there at once", headers=_after(1.0))
-        self._in_work[place] += 1
+            in_work, most, name, wait_s = self._streams, limits.streams_per_address, "streams", STREAM_S
+        if in_work[place] >= most:
+            raise web.HTTPTooManyRequests(text=f"too many {name} from there at once", headers=_after(wait_s))
+        in_work[place] += 1
         try:
             yield
         finally:
-            self._in_work[place] -= 1
-            if not self._in_work[place]:
-                del self._in_work[place]
+            in_work[place] -= 1
+            if not in_work[place]:
+                del in_work[place]
 
     async def _read_body(self, request: web.Request) -> None:
         """Have the whole of a small body, which the request keeps. Raises 400, 408, 413."""

@@ -32,7 +32,7 @@ async def node(tmp_path: Path) -> AsyncIterator[Entrance]:
 
 def table() -> dict[tuple[str, str], Role | None]:
     """Request -> the least role that may make it, as README says."""
-    [text] = re.findall(r"^\| role \| may ask .*?\n\n", README, re.DOTALL | re.MULTILINE)
+    [text] = re.findall(r"^\| role \| may .*?\n\n", README, re.DOTALL | re.MULTILINE)
     found: dict[tuple[str, str], Role | None] = {}
     for role, requests in re.findall(r"^\| (nobody|monitor|view|operate|admin) \| (.*) \|$", text, re.MULTILINE):
         for method, path in re.findall(r"`([A-Z]+) (\S+)`", requests):

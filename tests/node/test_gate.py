@@ -179,6 +179,28 @@ async def test_one_address_has_so_many_requests_in_work(tmp_path: Path) -> None:
                         break
 
 
+async def test_one_address_has_so_many_streams(tmp_path: Path) -> None:
+    settings = Server(listen="127.0.0.1:0", trusted_proxies=("127.0.0.1",))
+    async with entrance(tmp_path, settings, Limits(streams_per_address=2)) as node, AsyncExitStack() as stack:
+        headers = {"Authorization": f"Bearer {node.token('view')}"}
+
+        def stream(address: str) -> aiohttp.client._WSRequestContextManager:
+            forwarded = headers | {"X-Forwarded-For": address}
+            return node.http.ws_connect(f"{node.url}/v1/stream", protocols=[PROTOCOL], headers=forwarded)
+
+        first = await stream("10.0.0.1")
+        await stack.enter_async_context(stream("10.0.0.1"))
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="429"):
+            await stream("10.0.0.1")
+        await stack.enter_async_context(stream("10.0.0.2"))
+        await first.close()
+        async with asyncio.timeout(10):
+            while True:
+                with suppress(aiohttp.WSServerHandshakeError):
+                    await stack.enter_async_context(stream("10.0.0.1"))
+                    break
+
+
 @pytest.mark.parametrize("kind", ["text", "ping"])
 async def test_a_stream_that_says_too_much_is_read_no_faster_and_others_notice_nothing(
     tmp_path: Path, kind: str
