@@ -13,6 +13,7 @@ from typing import Protocol
 import aiohttp
 
 from node.auth import COOKIE, SUBPROTOCOL
+from node.shared import BODIES_KEPT
 from protocol import messages as m
 from tests.fuzz.mutation import mutant
 from tests.fuzz.parsers import SAID
@@ -61,6 +62,9 @@ async def ask_everything(url: str, token: str) -> None:
     async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(ssl=False), headers=headers) as http:
         for method, path, body in asked:
             async with http.request(method, url + path, data=body, allow_redirects=False) as answer:
+                await answer.read()
+        for place in range(BODIES_KEPT):  # what is kept of foveae is full then
+            async with http.get(f"{url}/v1/scans/latest/fovea?u={place / BODIES_KEPT}&v=0.5") as answer:
                 await answer.read()
 
 
