@@ -158,11 +158,11 @@ def read_surface(path: Path, placing: Placing | None = None) -> Grid | Mesh:
     return found
 
 
-def joined(*notes: str) -> str:
-    """Notes one behind the other. Where they are too long for a scan, the older ones lose their beginning."""
+def joined(found: str, *notes: str) -> str:
+    """What a scan came with, and our own notes behind it, each a sentence. Where they are too long for a scan, the older ones lose their beginning."""
     from exchange.native import NOTE_MAX
 
-    text = ". ".join(note for note in notes if note)
+    text = ". ".join(filter(None, (found, *(note[:1].upper() + note[1:] for note in notes))))
     return text if len(text) <= NOTE_MAX else f"... {text[4 - NOTE_MAX :]}"
 
 

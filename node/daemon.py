@@ -112,8 +112,10 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
         log.warning("library: after the last end: %s", found)
     for problem in library.problems:
         log.warning("library: %s left alone: %s", problem.name, problem.reason)
-    keep = partial(_keep, library)
-    for said in await asyncio.to_thread(publish_complete, library.sweeps, keep, config.capture.repair):
+    finished: list[Scan] = []
+    for said in await asyncio.to_thread(
+        publish_complete, library.sweeps, lambda assembly: finished.append(_keep(library, assembly)), config.capture.repair
+    ):
         log.warning("library: %s", said)
     way = RightOfWay()
     exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers, way)
@@ -126,6 +128,8 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
     server = NodeServer(config, info, exhibits, live, capture, access, tls)
     host, port = await server.start()
     stack.push_async_callback(server.stop)
+    for scan in finished:
+        server.swept(scan.id)
     announce.append(lambda scan_id, sweep: loop.call_soon_threadsafe(server.swept, scan_id, sweep))
     if capture is not None:
         capture.start()

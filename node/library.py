@@ -166,7 +166,8 @@ class Library:
             return self._ready(scan_id) or self._open(scan_id)
 
     def add(self, grid: Grid, about: About) -> Scan:
-        """Keep a grid, safe on disk before this returns. The same content again is the same scan, now the newest.
+        """Keep a grid, safe on disk before this returns. The same content again is the same scan, now the newest; where
+        it comes as a file, what is known of its sweep or of the scans it was made of stays.
 
         What clients need is derived while the disk is busy. Raises LibraryError when it cannot be written; then
         nothing of it is left.
@@ -232,6 +233,8 @@ class Library:
     def _write(self, grid: Grid, about: About) -> ScanSummary:
         scan_id = content_id(grid)
         sequence = 1 + max((summary.sequence for summary in self._known.values()), default=0)
+        if scan_id in self._known:
+            about = _come_again(self._known[scan_id].about, about)
         record = Record(FORMAT, scan_id, sequence, grid.spec, about, len(grid.repairs))
         try:
             if scan_id in self._known:
@@ -338,3 +341,12 @@ def _scan(summary: ScanSummary, grid: Grid, derived: _Derived) -> Scan:
         summary.id, grid.spec, summary.about, grid.range_steps, grid.texture, derived.coarse, derived.filled, pyramid,
         grid.repairs,
     )  # fmt: skip
+
+
+def _come_again(known: About, about: About) -> About:
+    """What is to be said of a scan that comes a second time: a file knows less of where it came from than we do."""
+    if about.source != "import":
+        return about
+    return replace(
+        known, created_unix_s=about.created_unix_s, name=about.name or known.name, note=about.note or known.note
+    )

@@ -215,10 +215,10 @@ class NodeServer:
     async def _close_audit(self, app: web.Application) -> None:
         await asyncio.to_thread(self.audit.close)
 
-    def swept(self, scan_id: str, sweep: int) -> None:
+    def swept(self, scan_id: str, sweep: int = 0) -> None:
         """A sweep has become a scan: note it, tell every client, and see whether it is to be a sphere, too.
 
-        sweep : which of the node's finished ones it is.
+        sweep : which of the node's finished ones it is, 0 for one that an earlier run of the node took.
         """
         self.audit.note("scanned", NODE, scan=scan_id)
         self.publish(m.Published(scan_id, sweep))

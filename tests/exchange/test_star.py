@@ -191,7 +191,7 @@ def test_a_grid_keeps_its_geometry_unless_another_is_wanted(tmp_path: Path) -> N
     with open(tmp_path / "level.npz", "wb") as file:
         write_native(level.grid, file)
     closed = read_scan(tmp_path / "level.npz", options=ReadOptions(geometry="sphere", caps=True))
-    assert closed.grid.spec.geometry == "sphere" and "a cylinder seen from a centre" in closed.note
+    assert closed.grid.spec.geometry == "sphere" and "A cylinder seen from a centre" in closed.note
     with pytest.raises(ExchangeError, match="--geometry sphere"):
         ReadOptions(geometry="cylinder", caps=True)
 

@@ -113,6 +113,14 @@ def test_scans_are_listed_newest_first_whatever_the_clock_said(tmp_path: Path) -
         assert [summary.sequence for summary in current.scans()] == [4, 3, 2, 1]
 
 
+def test_a_scan_that_comes_back_as_a_file_keeps_what_is_known_of_it(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    library.add(noise(0), About(1e9, "derived", "head", note="lids", made_from=("0" * 32,)))
+    again = library.add(noise(0), About(2e9, "import", "bust"))
+    assert again.about == About(2e9, "derived", "bust", note="lids", made_from=("0" * 32,))
+    assert reopened(library).open(again.id).about == again.about
+
+
 def test_the_same_content_again_is_the_same_scan_and_the_newest(tmp_path: Path) -> None:
     library = Library(tmp_path)
     first = library.add(noise(0), ABOUT)

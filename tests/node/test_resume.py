@@ -1,6 +1,9 @@
 """Sweeps that were cut, by the plug, the node's end or a disk: which go on, and which become a scan."""
 
+import asyncio
+import shutil
 from collections.abc import Callable
+from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,8 +11,11 @@ from typing import Any
 import pytest
 
 from drivers.scanner import SweepInterrupted, SweepReport, SweepStarted
+from node import config, derive
 from node.assemble import Assembly
+from node.audit import done_trail, read_trail
 from node.capture import Manner
+from node.daemon import start_node
 from node.journal import Journals
 from node.library import content_id
 from node.resume import publish_complete
@@ -187,3 +193,31 @@ def test_complete_sweeps_of_a_crashed_node_are_published_as_they_would_have_been
     (not_taken,) = refused
     assert content_id(made[0].grid) == content_id(not_taken)
     assert sweeps.interrupted() == [] and publish_complete(sweeps, made.append) == []
+
+
+async def test_a_complete_sweep_of_a_crashed_node_is_told_of_as_any_when_the_node_starts(
+    plug: Plug, node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def crash(grid: Grid) -> None:
+        raise LibraryError("as good as a crash")
+
+    node.deliver = crash
+    plug.plug(device())
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    node.wait_for(SweepInterrupted)
+    node.capture.stop()
+    asked: asyncio.Queue[Grid] = asyncio.Queue()
+    loop = asyncio.get_running_loop()
+    monkeypatch.setattr(derive, "closes", lambda grid: loop.call_soon_threadsafe(asked.put_nowait, grid) and False)
+    shutil.move(tmp_path / "sweeps", tmp_path / "library" / "sweeps")
+    folder = config.Library(str(tmp_path / "library"))
+    settings = config.Config(
+        server=config.Server(listen="127.0.0.1:0", insecure=True), library=folder, discovery=config.Discovery(False)
+    )
+    async with AsyncExitStack() as stack:
+        started = await start_node(settings, stack)
+        assert is_truth(await asyncio.wait_for(asked.get(), WAIT_S))  # whether it is to be a sphere, too
+        scan = started.exhibits.library.scans()[0].id
+    told = list(read_trail(done_trail(tmp_path / "library", 1 << 20), scan=scan))
+    assert [entry.event for entry in told] == ["scanned"]

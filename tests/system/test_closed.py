@@ -45,7 +45,7 @@ def test_a_cylinder_is_closed_here_as_on_the_node(tmp_path: Path, url: str, caps
     assert here == there and here["geometry"] == "sphere" and "made up" in here["note"]
 
     assert main(["derive", "--scan", there["scan"], "--geometry", "cylinder", *at_node]) == 0
-    assert "a sphere as its axis sees it" in capsys.readouterr().out
+    assert "A sphere as its axis sees it" in capsys.readouterr().out
     assert main(["scans", *at_node]) == 0
     assert " sphere  can\n" in capsys.readouterr().out
     told(capsys, "export", str(tmp_path / "closed.npz"), "--scan", there["scan"], *at_node)
