@@ -159,7 +159,7 @@ def read_surface(path: Path, placing: Placing | None = None) -> Grid | Mesh:
 
 
 def joined(found: str, *notes: str) -> str:
-    """What a scan came with, and our own notes behind it, each a sentence. Where they are too long for a scan, the older ones lose their beginning."""
+    """What a scan came with, and our notes behind it, each a sentence; where it is too long, the older lose their start."""
     from exchange.native import NOTE_MAX
 
     text = ". ".join(filter(None, (found, *(note[:1].upper() + note[1:] for note in notes))))

@@ -113,9 +113,11 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
     for problem in library.problems:
         log.warning("library: %s left alone: %s", problem.name, problem.reason)
     finished: list[Scan] = []
-    for said in await asyncio.to_thread(
-        publish_complete, library.sweeps, lambda assembly: finished.append(_keep(library, assembly)), config.capture.repair
-    ):
+
+    def keep(assembly: Assembly) -> None:
+        finished.append(_keep(library, assembly))
+
+    for said in await asyncio.to_thread(publish_complete, library.sweeps, keep, config.capture.repair):
         log.warning("library: %s", said)
     way = RightOfWay()
     exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers, way)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import aiohttp
+
 from client import connect
 from client.truth import Truth
 from foveascan import started
@@ -51,3 +53,10 @@ def run_line(stack: ExitStack, folder: Path, *simulate: str) -> RunningNode:
     process, ready = stack.enter_context(started(*serve, "--insecure", "--json", environment=beside))
     sweep(ready["url"])
     return RunningNode(ready["url"], Truth.read(truth), process, folder)
+
+
+async def surveyed(url: str) -> None:
+    """Returns once the node has measured the textures of what is open: until then it guesses."""
+    async with aiohttp.ClientSession() as http:
+        while (await (await http.get(f"{url}/v1/node")).json())["surveying"]:
+            await asyncio.sleep(0.05)

@@ -20,7 +20,7 @@ from foveascan import started
 from protocol import messages as m
 from protocol.errors import LocalWireError
 from protocol.lattice import QUARTERS, Parameters, build_lattice
-from tests.system.line import SHARED_DATA, RunningNode
+from tests.system.line import SHARED_DATA, RunningNode, surveyed
 
 EXACT = {"range": {"p": 1, "quantum": 1}}
 LOSSLESS = {"range": {"p": 1, "quantum": 1}, "texture": {"p": 1, "quality": 255}}
@@ -242,13 +242,6 @@ async def test_real_scans_at_s(name: str, line: Callable[..., RunningNode]) -> N
             assert compared["ok"], compared
             assert_untouched_outside(update, before, model)
             assert_sample_nearest_click(update, model, node, u, v)
-
-
-async def surveyed(url: str) -> None:
-    """Returns once the node has measured the textures of what is open: until then it guesses."""
-    async with aiohttp.ClientSession() as http:
-        while (await (await http.get(f"{url}/v1/node")).json())["surveying"]:
-            await asyncio.sleep(0.05)
 
 
 @asynccontextmanager
