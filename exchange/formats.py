@@ -159,7 +159,7 @@ def read_surface(path: Path, placing: Placing | None = None) -> Grid | Mesh:
 
 
 def joined(found: str, *notes: str) -> str:
-    """What a scan came with, and our notes behind it, each a sentence; where it is too long, the older lose their start."""
+    """What a scan came with, and our notes behind it; where that is too long, the older ones lose their beginning."""
     from exchange.native import NOTE_MAX
 
     text = ". ".join(filter(None, (found, *(note[:1].upper() + note[1:] for note in notes))))
