@@ -31,6 +31,11 @@ class RangeModel:
         within = spec.width if spec.geometry == "cylinder" else 0
         self._codes = {p: _error_codes(range_steps, filled, p) for p in SPACINGS if within and not within % p}
 
+    @property
+    def knows(self) -> bool:
+        """Whether it can say anything of its scan."""
+        return bool(self._codes)
+
     def error(self, region: Region, p: int) -> float:
         """99th percentile of the error over a region's measured cells, 5% too high at most; infinite where unknown."""
         if p == 1 or p not in self._codes:

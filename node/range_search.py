@@ -55,7 +55,8 @@ class RangeSearch:
         encodes: Encodes,
     ) -> None:
         self._scan, self._state, self._look, self._region, self._encodes = scan, state, look, region, encodes
-        self._model, self._hurried = model, hurried
+        self._model = model if model is not None and model.knows else None
+        self._hurried = hurried
         self.target_steps = look.range_mm / scan.spec.step_mm
         self._expected: dict[RangeParameters, float] = {}
         self._errors: dict[int, float] = {}
