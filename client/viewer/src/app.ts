@@ -30,6 +30,7 @@ import type { ViewState } from './url_state.ts';
 import type { Place } from './view/room.ts';
 
 const CAPTURE_MS = 2000;
+const LIST_MS = 10_000;
 const WRITE_MS = 200;
 const NOWHERE: ViewState = { scan: null, camera: null, foveae: [], pins: [], beside: null };
 
@@ -88,6 +89,7 @@ export class App {
       clicked: (place) => this.clicked(this.comparison.picture!, place),
       hovered: (place) => this.hovered(this.comparison.picture!, place),
       changed: () => {
+        if (!this.comparison.picture) this.latest = this.pane.measuring;
         this.showComparison();
         this.writeState();
       },
@@ -113,7 +115,15 @@ export class App {
     addEventListener('hashchange', () => this.addressChanged());
     addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
+    addEventListener('focus', () => void this.refreshScans());
     setInterval(() => void this.refreshCapture(), CAPTURE_MS);
+    setInterval(() => void this.refreshScans(), LIST_MS);
+  }
+
+  /** All pictures; the one of the open scan is the last. */
+  private get panes(): Pane[] {
+    const { picture } = this.comparison;
+    return picture ? [picture, this.pane] : [this.pane];
   }
 
   private tell(message: ToWorker): void {
@@ -131,7 +141,7 @@ export class App {
         void this.refreshScans();
         break;
       case 'liveStarted':
-        this.sweep.started(said.grid, this.pane.info === null);
+        this.sweep.started(said.grid, this.pane.info === null && this.state.scan === null);
         break;
       case 'livePicture':
         this.sweep.picture(said.steps, said.texels);
@@ -175,7 +185,7 @@ export class App {
 
   private opened(info: ScanInfo, fresh: boolean, framed: boolean): void {
     this.sweep.leave();
-    this.frame.showEmpty(false);
+    this.frame.showEmpty(null);
     if (!fresh) return;
     this.scans.mark(info.id);
     this.about.show(info);
@@ -199,16 +209,30 @@ export class App {
     this.writeState();
   }
 
-  /** The scan that was asked for is gone: show another one, if there is any. */
+  /** What was asked for is not there. No other scan takes its place: it might pass for the one that was meant. */
   private missing(): void {
-    this.frame.showEmpty(this.pane.info === null);
-    if (this.state.scan && !this.pane.info) this.pane.open('latest');
-    this.state.scan = null;
+    if (!this.state.scan && this.sweep.isWatched) return; // the first one is coming
+    this.sweep.leave();
+    this.close();
+    this.frame.showEmpty(this.state.scan ? 'gone' : 'none');
+    void this.refreshScans();
+  }
+
+  /** Show nothing of any scan. */
+  private close(): void {
+    this.sidecar.close();
+    this.comparison.close();
+    this.pane.clear();
+    this.pins.show([]);
+    this.about.hide();
+    this.worth.hide();
+    this.scans.mark(null);
+    this.showComparison();
   }
 
   /** The picture shows a sweep: nothing that was marked on a scan belongs there. */
   private watched(): void {
-    this.frame.showEmpty(false);
+    this.frame.showEmpty(null);
     this.comparison.close();
     this.pane.marks.setPins([]);
     this.beginMeasuring();
@@ -255,16 +279,20 @@ export class App {
   private toolChanged(tool: Tool): void {
     this.frame.hintAt(tool);
     if (tool !== 'pin') this.pins.panel.ask(null);
-    this.beginMeasuring();
+    // The latest is told last: the panel shows it.
+    const others = this.panes.map(({ measuring }) => measuring).filter((one) => one !== this.latest);
+    for (const measuring of [...others, this.latest]) measuring.choose(kindOf(tool));
+    if (!kindOf(tool)) this.frame.say('');
   }
 
+  /** Forget all points. */
   private beginMeasuring(): void {
-    for (const pane of [this.comparison.picture, this.pane]) pane?.measuring.begin(kindOf(this.look.tools.tool) ?? 'distance');
+    for (const pane of this.panes) pane.measuring.begin(kindOf(this.look.tools.tool) ?? 'distance');
   }
 
   private showAs(): void {
     const { shading, overlay } = this.display;
-    for (const pane of [this.pane, this.comparison.picture]) pane?.stage.setLook(shading, overlay);
+    for (const pane of this.panes) pane.stage.setLook(shading, overlay);
   }
 
   private showComparison(): void {
@@ -280,9 +308,9 @@ export class App {
 
   private measured(measured: Measured): void {
     const isAsked = kindOf(this.look.tools.tool) !== null;
-    this.measurePanel.show(isAsked ? measured : null);
+    this.measurePanel.show(measured, isAsked);
     if (measured.alongMm !== null) this.frame.say(strings.measure.said(measured));
-    else if (isAsked) this.frame.say(strings.measure.advice(measured));
+    else if (isAsked && this.pane.info) this.frame.say(strings.measure.advice(measured, true));
   }
 
   // What is kept at the node
@@ -306,12 +334,7 @@ export class App {
       this.frame.say(strings.failed((error as Error).message));
       return;
     }
-    this.sidecar.close();
-    this.comparison.close();
-    this.pane.clear();
-    this.beginMeasuring();
-    this.about.hide();
-    this.worth.hide();
+    this.close();
     this.state = { ...NOWHERE };
     await this.refreshScans();
     this.pane.open('latest');
@@ -323,12 +346,15 @@ export class App {
   }
 
   private async refreshScans(): Promise<void> {
+    const shown = this.panes.map((pane) => ({ pane, id: pane.info?.id }));
     try {
-      this.scans.show(await listScans());
-      this.showComparison();
+      if (this.scans.show(await listScans())) this.showComparison();
     } catch {
       return; // the line above the picture says why
     }
+    if (this.sweep.isWatched) return;
+    const listed = new Set(this.scans.scans.map(({ id }) => id));
+    for (const { pane, id } of shown) if (id && id === pane.info?.id && !listed.has(id)) pane.open(id); // the node will say that it is gone
   }
 
   private async refreshCapture(): Promise<void> {

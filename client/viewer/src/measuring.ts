@@ -40,6 +40,12 @@ export class Measuring {
     this.clear();
   }
 
+  /** Measure this from now on, or nothing; points stay, unless something else is measured. */
+  choose(kind: Kind | null): void {
+    if (kind && kind !== this.kind) this.begin(kind);
+    else this.put(this.places, this.legs);
+  }
+
   /** Forget all points. */
   clear(): void {
     this.put([], []);

@@ -71,13 +71,13 @@ export class OfflineCopy {
   private toolChanged(): void {
     const { tool } = this.tools;
     this.frame.hintAt(tool);
-    this.pane.measuring.begin(kindOf(tool) ?? 'distance');
+    this.pane.measuring.choose(kindOf(tool));
   }
 
   private measured(measured: Measured): void {
     const isAsked = kindOf(this.tools.tool) !== null;
-    this.measurePanel.show(isAsked ? measured : null);
-    if (measured.alongMm !== null) this.frame.say(strings.measure.said(measured));
+    this.measurePanel.show(measured, isAsked);
+    if (isAsked && measured.alongMm !== null) this.frame.say(strings.measure.said(measured));
   }
 }
 

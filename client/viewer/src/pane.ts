@@ -109,6 +109,7 @@ export class Pane {
         this.events.say(strings.copy.broken);
         break;
       case 'traffic':
+        if (said.received < this.bytes) this.bytes = 0; // another worker counts anew
         this.events.received(said.received - this.bytes);
         this.bytes = said.received;
         break;
@@ -129,8 +130,9 @@ export class Pane {
   /** Show nothing. */
   clear(): void {
     this.info = null;
+    delete this.noted.dataset['scan'];
     this.endLook();
-    [this.queue, this.bytes] = [[], 0];
+    [this.queue, this.foveae] = [[], []];
     this.stage.clear();
     this.marks.setPins([]);
     this.measuring.clear();
@@ -189,6 +191,7 @@ export class Pane {
   private refused({ look, code, message }: Extract<OfScan, { kind: 'refused' }>): void {
     if (look === this.looking?.look) this.endLook();
     if (code === 'not found') this.events.missing();
+    else if (code === 'not open' && this.info) this.open(this.info.id); // it was deleted: the node will say so
     else this.events.say(strings.failed(message));
   }
 

@@ -248,13 +248,13 @@ export class Stream {
   }
 
   private refuse({ request, code, message }: Extract<FromNode, { type: 'refused' }>): void {
-    if (request === this.request && this.looking) {
-      this.tell({ kind: 'refused', look: this.looking.look.request, code, message });
-      this.looking = null;
-      return;
+    if (request === this.opening) {
+      if (code === 'not found') this.model = this.recording = null; // nor is shown again what was open before
+      this.wanted = this.model?.info.id ?? null;
     }
-    if (request === this.opening) this.wanted = this.model?.info.id ?? null;
-    this.tell({ kind: 'refused', look: 0, code, message });
+    const look = (request === this.request && this.looking?.look.request) || 0;
+    if (look) this.looking = null;
+    this.tell({ kind: 'refused', look, code, message });
   }
 
   private showLive(bytes: Uint8Array): void {

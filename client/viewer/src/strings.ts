@@ -27,6 +27,7 @@ export const strings = {
   view: {
     label: '3D view of the scan. Arrow keys turn it, plus and minus zoom, Shift and arrows move it, Enter sharpens the middle or sets a point there, Backspace takes a point back, Escape stops what is coming, Home shows everything.',
     empty: 'No scan yet. Start a sweep, and watch it appear here.',
+    gone: 'That scan is not there any more. Choose another one, if there is any.',
     hints: {
       turn: 'Drag to turn · wheel to zoom',
       sharpen: 'Click to sharpen · drag to turn · wheel to zoom',
@@ -70,20 +71,20 @@ export const strings = {
     here: 'Sharpen the middle',
     follow: 'Follow my pointer',
     time: 'Time limit',
-    times: { '0': 'none', '0.25': '¼ second', '0.5': '½ second', '1': '1 second', '3': '3 seconds' } as Record<string, string>,
+    times: [['0', 'none'], ['0.25', '¼ second'], ['0.5', '½ second'], ['1', '1 second'], ['3', '3 seconds']],
     area: 'Area round the click',
-    areas: { '0.02': 'spot (2 %)', '0.05': 'normal (5 %)', '0.15': 'wide (15 %)', '0.4': 'very wide (40 %)', '1': 'all of it' } as Record<string, string>,
+    areas: [['0.02', 'spot (2 %)'], ['0.05', 'normal (5 %)'], ['0.15', 'wide (15 %)'], ['0.4', 'very wide (40 %)'], ['1', 'all of it']],
     falloff: 'Around it, detail falls off',
-    falloffs: { auto: 'as the node sees fit', '2': 'at once (α 2)', '0.5': 'quickly (α 0.5)', '0.1': 'slowly (α 0.1)' } as Record<string, string>,
+    falloffs: [['auto', 'as the node sees fit'], ['2', 'at once (α 2)'], ['0.5', 'quickly (α 0.5)'], ['0.1', 'slowly (α 0.1)']],
     quality: 'Quality',
-    qualities: { preview: 'quick look', fine: 'fine (40 dB, 0.1 mm)', exact: 'exact' } as Record<string, string>,
+    qualities: [['preview', 'quick look'], ['fine', 'fine (40 dB, 0.1 mm)'], ['exact', 'exact']],
   },
   show: {
     heading: 'Display',
     shading: 'Surface',
-    shadings: { lit: 'skin, lit', relief: 'relief only', flat: 'colour only' } as Record<string, string>,
+    shadings: [['lit', 'skin, lit'], ['relief', 'relief only'], ['flat', 'colour only']],
     overlay: 'Overlay',
-    overlays: { none: 'none', range: 'spacing of the shape', texture: 'spacing of the colour' } as Record<string, string>,
+    overlays: [['none', 'none'], ['range', 'spacing of the shape'], ['texture', 'spacing of the colour']],
     legend: 'Spacing held, in samples: 1 is everything there is',
   },
   measure: {
@@ -98,10 +99,12 @@ export const strings = {
       ...(gapsMm > 0 ? [['of it over gaps', millimetres(gapsMm)] as [string, string]] : []),
       ...(kind === 'path' ? [['Points', String(count)] as [string, string]] : []),
     ],
-    advice: ({ kind, count, isSharp }: Measured) => {
+    /** isAsked: a click adds a point. */
+    advice: ({ kind, count, isSharp }: Measured, isAsked: boolean) => {
+      if (count > 1 && !isSharp) return 'Not all of these points are sharp yet: sharpen there, and the figures will follow.';
+      if (!isAsked) return '';
       if (count === 0) return 'Click the first point.';
       if (count === 1) return kind === 'path' ? 'Click the next point.' : 'Click the second point.';
-      if (!isSharp) return 'Not all of these points are sharp yet: sharpen there, and the figures will follow.';
       return kind === 'path' ? 'Click on for a longer path.' : 'Click for another distance.';
     },
     undo: 'Take a point back',

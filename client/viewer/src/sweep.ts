@@ -70,6 +70,7 @@ export class Sweep {
 
   /** Let go of the picture: a scan is shown. */
   leave(): void {
+    if (this.watched) this.panel.offer(true);
     this.watched = null;
   }
 

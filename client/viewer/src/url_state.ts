@@ -25,6 +25,7 @@ export interface ViewState {
 const FOVEAE_MAX = 24;
 const PINS_MAX = 100;
 const LABEL_MAX = 200;
+const ID_MAX = 200;
 
 /** The fragment of an address, without '#'. */
 export function formatState({ scan, camera, foveae, pins, beside }: ViewState): string {
@@ -52,13 +53,15 @@ export function parseState(fragment: string): ViewState {
   });
   const beside = parseId(fields.get('beside'));
   return {
-    scan: parseId(fields.get('scan')),
+    scan: parseScan(fields.get('scan')),
     ...view(''),
     pins: fields.getAll('pin').slice(0, PINS_MAX).flatMap((text) => parsePin(text) ?? []),
     beside: beside === null ? null : { scan: beside, ...view('beside-') },
   };
 }
 
+/** An id that makes no sense stays one that no scan has: not the newest scan, but none is to be shown then. */
+const parseScan = (text: string | null): string | null => text?.slice(0, ID_MAX).replace(/[^\w-]/g, '-') || null;
 const parseId = (text: string | null): string | null => (text && /^[\w-]{1,200}$/.test(text) ? text : null);
 
 function formatCamera({ azimuth, elevation, distance, target }: CameraPlace): string {

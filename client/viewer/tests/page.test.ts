@@ -45,9 +45,10 @@ test('an address holds a view, and nonsense in it is left out', () => {
   };
   assert.deepEqual(parseState(formatState(state)), state);
   const nothing = { scan: null, camera: null, foveae: [], pins: [], beside: null };
-  for (const text of ['', 'scan=../x', 'camera=1,2,3', 'camera=0,0,-1,0,0,0', 'fovea=2,0', 'fovea=x', 'pin=1,1,a', 'beside=../x']) {
+  for (const text of ['', 'scan=', 'camera=1,2,3', 'camera=0,0,-1,0,0,0', 'fovea=2,0', 'fovea=x', 'pin=1,1,a', 'beside=../x']) {
     assert.deepEqual(parseState(text), nothing, text);
   }
+  assert.deepEqual(parseState('scan=../x)'), { ...nothing, scan: '---x-' }, 'no scan has such an id, so none is shown');
 });
 
 test('waits grow from half a second to eight', () => {

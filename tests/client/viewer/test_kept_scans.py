@@ -61,6 +61,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kept]:
     grids |= {"lumpy": grid_of(STANDING), "fitting": GENERATORS["cylinder"](FITTING, 1)}
     grids |= {name: GENERATORS["cylinder"](shape, 1) for name, shape in (("wide", WIDE), ("endless", ENDLESS))}
     grids["later"] = later(grids["head"])
+    grids["brief"] = GENERATORS["cylinder"](SHAPES["cylinder"], 2)
     with ExitStack() as stack, ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
         ids = aside.submit(keep, folder, grids).result()
         serve = ["serve", "--library", str(folder), "--listen", "127.0.0.1:0", "--insecure", "--json"]
@@ -98,6 +99,73 @@ def test_a_path_is_as_long_as_it_is_on_the_surface(browser: Browser, kept: Kept)
         assert measured_places(page) == []
         page.get_by_role("radio", name="sharpens").check()
         assert not page.get_by_text("Along the surface").is_visible()
+
+
+def test_points_stay_while_they_are_sharpened(browser: Browser, kept: Kept) -> None:
+    with opened(browser, kept.at("head")) as page:
+        page.get_by_label("Quality", exact=True).select_option("exact")
+        page.get_by_label("Area round the click").select_option("1")
+        advice = page.get_by_text("Not all of these points are sharp yet")
+        first = page.locator("#notice", has_text="Click the first point.")
+        updates = 0
+        distance, path = [(0.46, 0.5), (0.55, 0.42)], [(0.45, 0.6), (0.5, 0.55), (0.56, 0.6)]
+        for tool, ends in (("measures", distance), ("traces a path", path)):
+            page.get_by_label(tool).check()
+            first.wait_for()
+            for end in ends:
+                click(page, *end)
+            places, coarse_mm = measured_places(page), length_mm(page, "Along the surface")
+            assert len(places) == len(ends)
+            page.get_by_role("radio", name="sharpens").check()
+            assert measured_places(page) == places
+            assert advice.is_visible() == (updates == 0), "one look is as wide as the scan"
+            updates += 1
+            click(page, 0.5, 0.5)
+            wait_updates(page, updates)
+            assert measured_places(page) == places and not advice.is_visible()
+            assert (length_mm(page, "Along the surface") != coarse_mm) == (updates == 1)
+            page.get_by_label(tool).check()
+            assert measured_places(page) == places
+        page.get_by_role("button", name="Start anew").click()
+        first.wait_for()
+        page.get_by_label("sets a pin").check()
+        assert not first.is_visible(), "a click does not do that now"
+
+
+def test_choices_stand_in_their_order(browser: Browser, kept: Kept) -> None:
+    with opened(browser, kept.at("cylinder")) as page:
+        for label, values in (
+            ("Area round the click", ["0.02", "0.05", "0.15", "0.4", "1"]),
+            ("Time limit", ["0", "0.25", "0.5", "1", "3"]),
+            ("Around it, detail falls off", ["auto", "2", "0.5", "0.1"]),
+        ):
+            assert page.get_by_label(label).evaluate("(one) => [...one.options].map(({ value }) => value)") == values
+
+
+def test_a_scan_that_is_gone_is_not_replaced_by_another(browser: Browser, kept: Kept) -> None:
+    gone = "That scan is not there any more."
+    with blank(browser) as (page, problems):
+        for scan in ("d" * 32, f"{kept.ids['head']})"):
+            page.goto("about:blank")
+            page.goto(f"{kept.url}/#scan={scan}")
+            page.get_by_text(gone).wait_for()
+            page.get_by_role("button", name="head").wait_for()
+            assert page.locator("html").get_attribute("data-scan") is None
+        page.get_by_role("button", name="brief").click()
+        page.wait_for_selector(f'html[data-scan="{kept.ids["brief"]}"]', state="attached")
+        assert not page.get_by_text(gone).is_visible()
+        page.goto(f"{kept.url}/#scan={'e' * 32}")
+        page.get_by_text(gone).wait_for()
+        page.wait_for_selector("html:not([data-scan])", state="attached")
+        page.get_by_role("button", name="brief").click()
+        page.wait_for_selector(f'html[data-scan="{kept.ids["brief"]}"]', state="attached")
+        assert page.request.delete(f"{kept.url}/v1/scans/{kept.ids['brief']}").ok
+        page.evaluate("() => dispatchEvent(new Event('focus'))")
+        page.get_by_text(gone).wait_for()
+        page.wait_for_selector("html:not([data-scan])", state="attached")
+        page.get_by_role("button", name="brief").wait_for(state="detached")
+        assert not page.get_by_text("This scan", exact=True).is_visible()
+    assert all("404" in problem for problem in problems), problems  # small pictures of what is gone
 
 
 @pytest.mark.parametrize("name", ["head", "lumpy"])
@@ -174,6 +242,7 @@ def test_two_scans_stand_beside_each_other_and_move_together(browser: Browser, k
     with opened(browser, address) as page:
         page.wait_for_selector('.picture[data-updates="2"][data-looking="no"]')
         wait_updates(page, 1)
+        assert page.get_by_label("Move both together").is_visible(), "the panel is unfolded"
         for view, picture in zip(("#view", "#view-beside"), pictures, strict=True):
             assert psnr(crop(page, 0.5, 0.5, 200, view), picture) > 40, "the address has both"
         page.locator("aside details").evaluate_all("(all) => all.forEach((one) => (one.open = true))")
@@ -204,6 +273,8 @@ def test_an_offline_copy_shows_the_same_and_asks_nobody(browser: Browser, kept: 
             page.get_by_role("button", name="Save the file").click()
         assert download.value.suggested_filename.startswith("head, copy of ")
         assert '"about":"head"' in Path(download.value.path()).read_text()
+        page.get_by_role("button", name="Offline copy of this view").click()
+        assert not page.get_by_label("Say in it whose scan it is").is_checked(), "asked anew"
     assert '"about":""' in file.read_text(), "whose scan it is stays unsaid"
     with opened(browser, file.as_uri(), allowed=file.as_uri()) as page:
         assert psnr(crop(page, 0.5, 0.5, 300), picture) > 45

@@ -35,6 +35,7 @@ export class ComparePanel {
     const { compare } = strings;
     const others = scans.filter(({ id }) => id !== open);
     this.element.hidden = open === null || others.length === 0;
+    if (beside !== null && this.more.hidden) this.element.open = true;
     this.more.hidden = beside === null;
     const subject = scans.find(({ id }) => id === open)?.subject;
     const same = others.filter((scan) => subject && scan.subject === subject);

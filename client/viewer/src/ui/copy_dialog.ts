@@ -19,6 +19,10 @@ export class CopyDialog {
       h('h2', { id: 'copy' }, copy.heading), h('p', {}, copy.what), h('p', {}, copy.beware), h('label', {}, named, copy.named),
       h('footer', { class: 'row' }, h('button', { type: 'button', class: 'secondary', click: close }, copy.no),
         h('button', { type: 'button', click: yes }, copy.yes))));
-    this.button = h('button', { type: 'button', class: 'secondary', click: () => this.element.showModal() }, copy.make);
+    const ask = () => {
+      named.checked = false; // whom one copy names, the next one does not
+      this.element.showModal();
+    };
+    this.button = h('button', { type: 'button', class: 'secondary', click: ask }, copy.make);
   }
 }

@@ -23,13 +23,16 @@ export function assign(element: Element, attributes: Attributes): void {
 
 let choices = 0;
 
+/** What can be chosen, in order; an object would put names that are numbers first. */
+export type Options = readonly (readonly [value: string, text: string])[];
+
 /** A labelled choice of one of several. */
 export function choice(
-  label: string, options: Record<string, string>, chosen: string, changed: (value: string) => void,
+  label: string, options: Options, chosen: string, changed: (value: string) => void,
 ): HTMLDivElement {
   const id = `choice-${++choices}`;
   const select = h('select', { id, change: () => changed(select.value) });
-  for (const [value, text] of Object.entries(options)) select.append(h('option', { value, selected: value === chosen }, text));
+  for (const [value, text] of options) select.append(h('option', { value, selected: value === chosen }, text));
   return h('div', {}, h('label', { for: id }, label), select);
 }
 

@@ -20,8 +20,10 @@ export class Frame {
   private readonly retry: HTMLButtonElement;
   private readonly notice = h('p', { id: 'notice', role: 'status' });
   private readonly hint = h('p', { id: 'hint' }, strings.view.hints.sharpen);
-  private readonly empty = h('p', { id: 'empty', hidden: true }, strings.view.empty);
+  private readonly empty = h('p', { id: 'empty', role: 'status', hidden: true });
   private readonly panel = h('aside', { id: 'panel' });
+  /** What is said where there is no scan. */
+  private none: string = strings.view.empty;
   private retryTimer: ReturnType<typeof setInterval> | undefined;
   private noticeTimer: ReturnType<typeof setTimeout> | undefined;
 
@@ -73,12 +75,15 @@ export class Frame {
 
   /** Whether a sweep may be started here: then it is proposed where there is nothing to see. */
   allow(sweeps: boolean): void {
-    this.empty.textContent = sweeps ? strings.view.empty : strings.scans.none;
+    const none = sweeps ? strings.view.empty : strings.scans.none;
+    if (this.empty.textContent === this.none) this.empty.textContent = none;
+    this.none = none;
   }
 
-  /** Whether to say that there is nothing to see yet. */
-  showEmpty(empty: boolean): void {
-    this.empty.hidden = !empty;
+  /** Say that there is nothing to see: none yet, or not any more; null: there is. */
+  showEmpty(why: 'none' | 'gone' | null): void {
+    this.empty.hidden = why === null;
+    if (why) this.empty.textContent = why === 'gone' ? strings.view.gone : this.none;
   }
 
   /** How the connection stands; while there is none, counts down to the next attempt. */

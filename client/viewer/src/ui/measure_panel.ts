@@ -17,13 +17,12 @@ export class MeasurePanel {
     this.element.hidden = true;
   }
 
-  /** null: nothing is to be measured. */
-  show(measured: Measured | null): void {
-    this.element.hidden = measured === null;
-    if (!measured) return;
+  /** isAsked: a click adds a point. Else what was measured stays to be read. */
+  show(measured: Measured, isAsked: boolean): void {
+    this.element.hidden = !isAsked && measured.count === 0;
     const { measure } = strings;
     refill(this.figures, ...measure.figures(measured).flatMap(([name, figure]) => [h('dt', {}, name), h('dd', {}, figure)]));
-    this.advice.textContent = measure.advice(measured);
+    this.advice.textContent = measure.advice(measured, isAsked);
     for (const button of this.buttons) button.disabled = measured.count === 0;
   }
 }

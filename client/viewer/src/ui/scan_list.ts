@@ -12,14 +12,19 @@ export class ScanList {
   private readonly inView = new IntersectionObserver((entries) => this.seen(entries));
   scans: ScanSummary[] = [];
   private current: string | null = null;
+  /** To be filled anew, even with the same scans. */
+  private isStale = true;
 
   constructor(private readonly open: (id: string) => void, private readonly wantPicture: (id: string) => void) {
     this.element = section(strings.scans.heading, true, this.list);
   }
 
-  show(scans: ScanSummary[]): void {
+  /** Whether it is another list than before. */
+  show(scans: ScanSummary[]): boolean {
+    const isOther = this.isStale || JSON.stringify(scans) !== JSON.stringify(this.scans);
     this.scans = scans;
-    this.fill();
+    if (isOther) this.fill();
+    return isOther;
   }
 
   mark(id: string | null): void {
@@ -37,6 +42,7 @@ export class ScanList {
   picture(id: string, picture: Blob | null): void {
     if (!picture) {
       this.pictures.delete(id);
+      this.isStale = true;
       return;
     }
     const address = URL.createObjectURL(picture);
@@ -54,6 +60,7 @@ export class ScanList {
   }
 
   private fill(): void {
+    this.isStale = false;
     this.images.clear();
     this.inView.disconnect();
     const focused = (document.activeElement as HTMLElement | null)?.dataset['scan'];
