@@ -29,8 +29,7 @@ import { formatState, parseState } from './url_state.ts';
 import type { ViewState } from './url_state.ts';
 import type { Place } from './view/room.ts';
 
-const CAPTURE_MS = 2000;
-const LIST_MS = 10_000;
+const [CAPTURE_MS, LIST_MS] = [2000, 10_000];
 const WRITE_MS = 200;
 const NOWHERE: ViewState = { scan: null, camera: null, foveae: [], pins: [], beside: null };
 
@@ -122,8 +121,7 @@ export class App {
 
   /** All pictures; the one of the open scan is the last. */
   private get panes(): Pane[] {
-    const { picture } = this.comparison;
-    return picture ? [picture, this.pane] : [this.pane];
+    return [this.comparison.picture, this.pane].filter((pane) => pane !== null);
   }
 
   private tell(message: ToWorker): void {
@@ -279,9 +277,7 @@ export class App {
   private toolChanged(tool: Tool): void {
     this.frame.hintAt(tool);
     if (tool !== 'pin') this.pins.panel.ask(null);
-    // The latest is told last: the panel shows it.
-    const others = this.panes.map(({ measuring }) => measuring).filter((one) => one !== this.latest);
-    for (const measuring of [...others, this.latest]) measuring.choose(kindOf(tool));
+    for (const measuring of [...this.panes.map((pane) => pane.measuring), this.latest]) measuring.choose(kindOf(tool)); // the panel shows the last
     if (!kindOf(tool)) this.frame.say('');
   }
 
@@ -331,8 +327,7 @@ export class App {
     try {
       await deleteScan(scan);
     } catch (error) {
-      this.frame.say(strings.failed((error as Error).message));
-      return;
+      return this.frame.say(strings.failed((error as Error).message));
     }
     this.close();
     this.state = { ...NOWHERE };
