@@ -153,7 +153,7 @@ def _add_geometry(parser: argparse.ArgumentParser) -> None:
 def _add_mesh(parser: argparse.ArgumentParser) -> None:
     mesh = parser.add_argument_group("meshes", "what a mesh does not say itself")
     mesh.add_argument(
-        "--size", type=_size, default="M", metavar="S|M|L|WxH:WtxHt", help="samples and texels (M)"
+        "--size", type=_size, default="M", metavar="S|M|L|WxH:WtxHt", help="samples and texels (M); S is read soonest"
     )
     mesh.add_argument("--up", choices=("z", "y", "x", "-z", "-y", "-x"), help="the axis that points up (z; glTF: y)")
     mesh.add_argument("--unit-mm", type=positive, metavar="MM", help="millimetres of its unit (1; glTF: 1000)")

@@ -186,7 +186,8 @@ class Collector:
             else:
                 self._request(missing)
         elif lost := self._ledger.lost_columns():
-            yield self._break(f"{lost} columns were lost and the scanner holds them no longer")
+            cure = "sweep again; if it stays so, it keeps too few columns for a line that is cut for so long"
+            yield self._break(f"{lost} columns were lost and the scanner holds them no longer: {cure}")
         elif (end.pieces, end.digest) != (self._ledger.expected, self._ledger.digest):
             yield self._break("the columns received are not those the scanner counted")
         else:

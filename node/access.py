@@ -107,6 +107,10 @@ class Access:
             self._write(replace(record, codes=(*waiting, offered)))
         return pairing.code_text(code)
 
+    def awaits(self, name: str, now_s: float) -> bool:
+        """Whether a code waits for whoever is to be called so, which another would replace."""
+        return any(code.name == name for code in _valid(self._current().codes, now_s))
+
     def grant(self, role: pairing.Role, name: str, now_s: float) -> str:
         """A token at once, for a program that cannot join; its text, which is kept nowhere."""
         key = pairing.key_of(pairing.parse_code(self.offer(role, name, now_s)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,13 +58,16 @@ def run_pair(args: argparse.Namespace) -> int:
         raise AccessError("there is no certificate yet: start the node once, without --insecure")
     shown = certificate_fingerprint(certificate)
     access = _access(config)
+    replaces = access.awaits(args.name, time.time())
     if args.token:
         token = access.grant(args.role, args.name, time.time())
+        _tell_replaced(args.name, replaces)
         note_at_console(config, "paired", what=f"{args.name}: {args.role}")
         said = {"token": token, "fingerprint": shown, "name": args.name, "role": args.role}
         print(json.dumps(said) if args.json else token, flush=True)
         return 0
     code = access.offer(args.role, args.name, time.time(), 60 * args.minutes)
+    _tell_replaced(args.name, replaces)
     note_at_console(config, "code offered", what=f"{args.name}: {args.role}")
     said = {"code": code, "fingerprint": shown, "name": args.name, "role": args.role, "minutes": args.minutes}
     lines = [
@@ -74,6 +78,11 @@ def run_pair(args: argparse.Namespace) -> int:
     ]
     print(json.dumps(said) if args.json else "\n".join(lines), flush=True)
     return 0
+
+
+def _tell_replaced(name: str, replaces: bool) -> None:
+    if replaces:
+        print(f"foveascan: the code offered to {name!r} before is void now", file=sys.stderr)
 
 
 def run_list(args: argparse.Namespace) -> int:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import socket
-import threading
+import time
+from collections.abc import Generator
+from contextlib import closing, suppress
 from ipaddress import ip_address
+from queue import Empty, SimpleQueue
 from types import TracebackType
 
-from zeroconf import IPVersion, ServiceBrowser, ServiceInfo, ServiceStateChange, Zeroconf
+from zeroconf import Error, IPVersion, ServiceBrowser, ServiceInfo, ServiceStateChange, Zeroconf
 from zeroconf.asyncio import AsyncZeroconf
 
 from protocol.messages import PROTOCOL
@@ -15,6 +18,7 @@ from protocol.messages import PROTOCOL
 SERVICE = "_foveascan._tcp.local."
 NAME_MAX_BYTES = 63
 HEARD_S = 3.0
+ANSWER_S = 0.5  # then another announced node is asked
 
 
 class Advertisement:
@@ -53,18 +57,31 @@ def is_heard(host: str, node_id: str | None) -> bool:
     """
     interfaces = _interfaces(host)
     zeroconf = Zeroconf(interfaces=interfaces, ip_version=IPVersion.V4Only) if interfaces else Zeroconf()
-    heard = threading.Event()
+    try:
+        with zeroconf, closing(_announced(zeroconf)) as nodes:
+            return node_id is None or any(node.decoded_properties.get("id") == node_id for node in nodes)
+    except Error as error:
+        raise OSError(f"{type(error).__name__}: {error}") from error
+
+
+def _announced(zeroconf: Zeroconf) -> Generator[ServiceInfo]:
+    """Every node that says who it is within HEARD_S. Asked here, not by the browser's thread: that one is not
+    waited for by who closes zeroconf."""
+    names: SimpleQueue[str] = SimpleQueue()
 
     def on_change(zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
-        info = zeroconf.get_service_info(service_type, name)
-        if info is not None and info.decoded_properties.get("id") == node_id:
-            heard.set()
+        if state_change is not ServiceStateChange.Removed:
+            names.put(name)
 
-    with zeroconf:
-        if node_id is None:
-            return True
-        ServiceBrowser(zeroconf, SERVICE, handlers=[on_change])
-        return heard.wait(HEARD_S)
+    until_s = time.monotonic() + HEARD_S
+    with ServiceBrowser(zeroconf, SERVICE, handlers=[on_change]), suppress(Empty):
+        while (left_s := until_s - time.monotonic()) > 0:
+            name = names.get(timeout=left_s)
+            info = zeroconf.get_service_info(SERVICE, name, timeout=round(1000 * min(left_s, ANSWER_S)))
+            if info is None:
+                names.put(name)
+            else:
+                yield info
 
 
 def _interfaces(host: str) -> list[str] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,15 +33,11 @@ def print_audit(config: Config, library: Path, args: argparse.Namespace) -> int:
     import msgspec
 
     from node.audit import done_trail, read_trail, refused_trail
-    from protocol.errors import AccessError
 
     trail = refused_trail(library) if args.refused else done_trail(library, config.audit.bytes_max)
-    found = read_trail(trail, since=args.since, scan=args.scan, by=args.by)
-    try:
-        for one in islice(found, args.limit or None):
-            print(msgspec.json.encode(one).decode() if args.json else _line(one))
-    except OSError as error:
-        raise AccessError(f"the audit log cannot be read: {error.strerror}; ask as root") from error
+    found = _readable(read_trail(trail, since=args.since, scan=args.scan, by=args.by))
+    for one in islice(found, args.limit or None):
+        print(msgspec.json.encode(one).decode() if args.json else _line(one))
     return 0
 
 
@@ -58,6 +54,16 @@ def note_at_console(config: Config, event: Event, scans: Sequence[str] = ("",), 
         done_trail(config.library.path, config.audit.bytes_max).append(lines)
     except OSError as error:
         print(f"foveascan: this is not in the audit log: {error.strerror or error}", file=sys.stderr)
+
+
+def _readable(entries: Iterator[Entry]) -> Iterator[Entry]:
+    """The same entries. Raises AccessError where they cannot be read."""
+    from protocol.errors import AccessError
+
+    try:
+        yield from entries
+    except OSError as error:
+        raise AccessError(f"the audit log cannot be read: {error.strerror}; ask as root") from error
 
 
 def _line(one: Entry) -> str:

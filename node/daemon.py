@@ -29,7 +29,7 @@ from node.library import About, Library, Scan
 from node.live import Live
 from node.log import set_log
 from node.notify import Beating, Notifier, keep_notified, status_text
-from node.reload import compare
+from node.reload import Change, compare
 from node.resume import publish_complete
 from node.right_of_way import RightOfWay
 from node.serve import NodeServer
@@ -54,7 +54,7 @@ class Node:
     exhibits: Exhibits
     capture: Capture | None
 
-    def use(self, wanted: Config) -> str:
+    def use(self, wanted: Config) -> Change:
         """Take what can be taken of other settings; what that was, and what was not. Raises AccessError."""
         change = compare(self.config, wanted)
         self.server.use(change.config)
@@ -62,7 +62,7 @@ class Node:
         set_log(change.config.log.level, change.config.log.format)
         if self.capture is not None:
             self.capture.sweep_like(manner_of(change.config))
-        return str(change)
+        return change
 
     def parts(self) -> dict[str, Beating]:
         """Whose progress shows that the node lives, beside the event loop's."""
@@ -98,7 +98,9 @@ async def run_node(config: Config, ready: Callable[[str], None], reread: Callabl
 
 def _reload(node: Node, reread: Callable[[], Config]) -> None:
     try:
-        log.warning("read the settings anew: %s", node.use(reread()))
+        change = node.use(reread())
+        level = logging.WARNING if change.taken or change.waiting else logging.INFO
+        log.log(level, "read the settings anew: %s", change)
     except (ConfigError, AccessError) as error:
         log.error("the settings stay as they were: %s", error)
 

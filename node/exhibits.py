@@ -10,10 +10,13 @@ from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from typing import Literal, TypeVar, overload
 
+import msgspec
+
 from node.classic import ClassicView, build_classic_view
-from node.first_view import FirstView, build_first_view, texture_as_seen
+from node.first_view import FirstView, build_first_view, scan_info, texture_as_seen
 from node.library import Library, Scan
 from node.range_model import RangeModel
 from node.right_of_way import RightOfWay
@@ -78,7 +81,7 @@ class Exhibits:
             raise
         if isinstance(view, FirstView):
             self._survey(scan, view)
-        return scan, view
+        return self._up_to_date(scan, view)
 
     def texture_model(self, scan: Scan) -> TextureModel | None:
         """What the scan's texture takes and reaches; None until that is measured."""
@@ -154,6 +157,14 @@ class Exhibits:
         self._closing.set()
         self._surveyor.shutdown(cancel_futures=True)
         self._pool.shutdown(cancel_futures=True)
+
+    def _up_to_date(self, scan: Scan, view: FirstView | ClassicView) -> Opening:
+        """Both as they are known now: the same samples may have come again since they were opened."""
+        about = self.library.summary(scan.id).about
+        if about == scan.about:
+            return scan, view
+        scan = replace(scan, about=about)
+        return scan, replace(view, info=msgspec.structs.replace(view.info, created=scan_info(scan).created))
 
     def _survey(self, scan: Scan, view: FirstView) -> None:
         """Have the scan's range and texture measured, one scan at a time, beside everything else."""

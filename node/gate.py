@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import resource
 import socket
 import ssl
@@ -101,9 +102,10 @@ class Gate:
                 listener.setblocking(False)
                 self._listeners.append(listener)
                 port = listener.getsockname()[1]  # the same for all where any free one is taken
-        except OSError:
+        except OSError as error:
             await self.close()
-            raise
+            place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+            raise OSError(error.errno, os.strerror(error.errno or 0), place) from error
         for listener in self._listeners:
             self._spawn(self._accept(listener, runner, tls))
         self._spawn(self._watch())

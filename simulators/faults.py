@@ -7,7 +7,6 @@ Faults are named on the command line as `flip=0.01,stall=2`; `parse_faults` know
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from protocol.errors import UsageError
 from protocol.framing import FRAME_OVERHEAD, encode_frame
+from protocol.grid import HEIGHT_MAX, STEPS_MAX, WIDTH_MAX
 from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepHeader, TextureColumn
 from simulators.flaws import Flaws
 from simulators.scanner import SimulatedScanner
@@ -61,6 +61,11 @@ _FLAW_NAMES = {
     "dropouts": "dropouts", "noise": "noise_steps",
 }  # fmt: skip
 FAULT_NAMES = tuple(field.name for field in fields(Faults)) + tuple(_FLAW_NAMES)
+_MOST = {
+    "stall": 3600, "unplug": 3600, "overshoot": 10, "noise": STEPS_MAX,
+    "dribble": 2**16, "ticks": 2**31 - 1, "dead": HEIGHT_MAX, "saturated": WIDTH_MAX,
+}  # fmt: skip
+_COUNTS = ("dribble", "ticks", "dead", "saturated", "reset", "minor", "major", "reversed")
 
 
 def parse_faults(text: str, seed: int = 0) -> tuple[Faults, Flaws]:
@@ -69,17 +74,21 @@ def parse_faults(text: str, seed: int = 0) -> tuple[Faults, Flaws]:
     Raises UsageError for a name or a number that makes no sense.
     """
     faults, flaws = Faults(), Flaws(seed=seed)
+    seen: set[str] = set()
     for item in filter(None, text.split(",")):
         name, _, given = item.strip().partition("=")
+        if name not in FAULT_NAMES:
+            raise UsageError(f"faults: {name!r} is none of {', '.join(FAULT_NAMES)}")
+        if name in seen:
+            raise UsageError(f"faults: {name} is given twice")
+        seen.add(name)
         value = _number(name, given or "1")
         if name in _FLAW_NAMES:
             place = _FLAW_NAMES[name]
             kind = type(getattr(flaws, place))
             flaws = dataclasses.replace(flaws, **{place: kind(value)})
-        elif name in FAULT_NAMES:
-            faults = dataclasses.replace(faults, **{name: value})
         else:
-            raise UsageError(f"faults: {name!r} is none of {', '.join(FAULT_NAMES)}")
+            faults = dataclasses.replace(faults, **{name: value})
     return faults, flaws
 
 
@@ -88,8 +97,10 @@ def _number(name: str, text: str) -> float:
         value = float(text)
     except ValueError:
         raise UsageError(f"faults: {name}={text!r} is no number") from None
-    if not 0 <= value < math.inf:
-        raise UsageError(f"faults: {name}={text} is below 0 or endless")
+    least, most = (1 if name == "dribble" else 0), _MOST.get(name, 1)
+    if not least <= value <= most or (name in _COUNTS and not value.is_integer()):
+        kind = "a whole number" if name in _COUNTS else "a number"
+        raise UsageError(f"faults: {name}={text} is not {kind} between {least} and {most}")
     return value
 
 

@@ -67,7 +67,8 @@ class Flaws:
         """(Ht, 3) what the colour camera makes of a column."""
         if not self.saturated_columns:
             return texels
-        blinded = np.random.default_rng((self.seed, 2, pass_index)).choice(width, self.saturated_columns, replace=False)
+        count = min(self.saturated_columns, width)
+        blinded = np.random.default_rng((self.seed, 2, pass_index)).choice(width, count, replace=False)
         return np.full_like(texels, SATURATED) if column in blinded else texels
 
     def _dead(self, height: int) -> list[int]:

@@ -47,7 +47,12 @@ class TcpListener:
     def plug_in(self) -> None:
         """Listen."""
         family = socket.AF_INET6 if ":" in self._place[0] else socket.AF_INET
-        self._listener = socket.create_server(self._place, family=family, backlog=1)
+        try:
+            self._listener = socket.create_server(self._place, family=family, backlog=1)
+        except OSError as error:
+            why = error.strerror if isinstance(error, socket.gaierror) else os.strerror(error.errno or 0)
+            cure = "choose another place to listen at (--path), or port 0 for any free one"
+            raise OSError(error.errno, f"{self.name}: {why}; {cure}") from error
         self._place = self._place[0], self._listener.getsockname()[1]
 
     def hang_up(self) -> None:

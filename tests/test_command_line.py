@@ -70,6 +70,7 @@ def test_wrong_usage_is_status_2_and_a_hint(arguments: tuple[str, ...]) -> None:
         (("serve", "--check", "--scanner", "usb:12"), "capture.scanner: 'usb:12' is not usb:VENDOR:PRODUCT or"),
         (("serve", "--check", "--listen", "7345"), "server.listen: expected HOST:PORT or [IPv6]:PORT"),
         (("simulate", "--path", "p", "--faults", "nope=1"), "faults: 'nope' is none of loss,"),
+        (("simulate", "--path", "p", "--faults", "dead=1.5"), "faults: dead=1.5 is not a whole number between 0 and"),
         (("simulate", "--path", "99999", "--link", "tcp"), "path: expected PORT or HOST:PORT"),
         (("simulate", "--path", "p", "--specimen", "nothing"), "specimen: nothing is none of"),
         (("demo", "--specimen", "nothing"), "specimen: nothing is none of"),

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from foveascan import PROGRAM, started
+from node.audit_command import note_at_console
+from node.config import Config
+from node.config import Library as LibrarySettings
 from node.library import About, Library
 from tests.node.scans import make_grid
 
@@ -59,6 +62,23 @@ def test_the_node_is_found_with_its_fingerprint(home: Path, url: str) -> None:
     _, offered, _ = run(home, "pair", "--name", "another", "--library", str(home / "library"))
     _, found, _ = run(home, "discover", "--name", "paired node")
     assert (found["url"], found["tls"], found["fingerprint"]) == (url, True, offered["fingerprint"])
+
+
+def test_a_code_that_takes_the_place_of_another_says_so(home: Path, url: str) -> None:
+    again = ("pair", "--name", "room 3", "--library", str(home / "library"))
+    assert run(home, *again)[2] == ""
+    assert run(home, *again)[2] == "foveascan: the code offered to 'room 3' before is void now\n"
+
+
+def test_whoever_reads_the_audit_log_may_go_away(tmp_path: Path) -> None:
+    note_at_console(Config(library=LibrarySettings(str(tmp_path))), "code offered", what="a: view")
+    environ = os.environ | {"XDG_CONFIG_HOME": str(tmp_path), "PYTHONUNBUFFERED": "1"}
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    audit = [*PROGRAM, "access", "audit", "--library", str(tmp_path)]
+    done = subprocess.run(audit, env=environ, stdout=write_end, stderr=subprocess.PIPE, timeout=60)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (141, b"")
 
 
 def test_pairing_needs_a_node_that_has_run(tmp_path: Path) -> None:

@@ -9,7 +9,9 @@ import pytest
 
 from node.coarse import FIRST_VIEW_BYTES
 from node.exhibits import PRESSING, Exhibits
-from node.library import Library
+from node.library import About, Library
+from protocol.messages import Profile
+from tests.node.scans import make_grid
 
 
 @pytest.fixture
@@ -54,3 +56,15 @@ async def test_who_gives_up_waiting_is_not_waited_for(exhibits: Exhibits) -> Non
         assert all(isinstance(end, asyncio.CancelledError) for end in ends)
     async with exhibits.turn() as is_pressing:
         assert not is_pressing
+
+
+@pytest.mark.parametrize("profile", ["default", "classic"])
+async def test_an_opened_scan_that_comes_again_is_told_of_as_it_came_last(exhibits: Exhibits, profile: Profile) -> None:
+    grid = make_grid(40, 24)
+    first = exhibits.library.add(grid, About(1e9))
+    _, view = await exhibits.open(first.id, "htj2k", profile)
+    exhibits.library.add(grid, About(2e9, name="again", note="twice"))
+    scan, again = await exhibits.open(first.id, "htj2k", profile)
+    assert scan.about == exhibits.library.summary(first.id).about == About(2e9, name="again", note="twice")
+    assert (view.info.created, again.info.created) == ("2001-09-09T01:46:40Z", "2033-05-18T03:33:20Z")
+    assert again.state is view.state

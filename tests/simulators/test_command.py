@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -148,6 +149,14 @@ def test_an_unknown_fault_is_refused_with_the_names_there_are(tmp_path: Path) ->
     args = parse("--path", str(tmp_path / "scanner"), "--faults", "rain=1")
     with pytest.raises(ConfigError, match="'rain' is none of loss, flip"):
         args.run(args)
+
+
+def test_a_busy_port_is_named_with_a_cure_there_is() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"127.0.0.1:{taken.getsockname()[1]}"
+        args = parse("--path", place, "--link", "tcp", "--specimen", "cylinder")
+        with pytest.raises(OSError, match=f"^.Errno 98. tcp:{place}: Address already in use; .*--path"):
+            args.run(args)
 
 
 def test_a_faulty_buffered_scanner_still_serves_the_truth(tmp_path: Path) -> None:

@@ -19,7 +19,13 @@ def test_every_name_is_understood(name: str) -> None:
     assert parse_faults(f"{name}=1") != (Faults(), Flaws())
 
 
-@pytest.mark.parametrize("text", ["rain", "loss=much", "loss=-1", "loss=inf", "loss=nan"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "rain", "loss=much", "loss=-1", "loss=inf", "loss=nan", "flip=2", "loss=0.1,loss=0.2", "dead=1.5",
+        "dead=100000", "dribble=0", "reset=2", "slip=1.1", "stall=1e9",
+    ],
+)  # fmt: skip
 def test_what_makes_no_sense_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="^faults: "):
         parse_faults(text)
