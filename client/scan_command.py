@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from typing import TYPE_CHECKING
 
 from client.arguments import add_node, chosen_node
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from protocol.messages import ScanQuality
 
 POLL_S = 0.2
+AWAY_S = 35.0  # a node goes on by itself with a sweep that was cut for half a minute ...
+BACK_S = 5.0  # ... as soon as the same scanner is there
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -59,6 +62,7 @@ async def _scan(args: argparse.Namespace) -> tuple[str, ScanQuality | None]:
 async def _sweep(session: Session, *, silent: bool) -> str:
     """Start a sweep when the scanner is ready, follow it, return the scan's id. Raises ScannerFault when it fails."""
     import asyncio
+    import time
 
     from tqdm import tqdm
 
@@ -67,6 +71,7 @@ async def _sweep(session: Session, *, silent: bool) -> str:
     published = session.published()
     await _ready(session)
     number = (await session.start_sweep())["sweep"]
+    cut, until_s = "", 0.0
     with tqdm(total=100, unit="%", desc="sweeping", leave=False, disable=True if silent else None) as bar:
         while True:
             await asyncio.sleep(POLL_S)
@@ -74,8 +79,18 @@ async def _sweep(session: Session, *, silent: bool) -> str:
             bar.update(round(100 * status["progress"]) - bar.n)
             if status["sweeps"] >= number:
                 return await anext(scan async for scan in published if scan.sweep == number)
-            if status["phase"] != "sweeping" and status["why"]:
-                raise ScannerFault(status["why"])
+            match status["phase"]:
+                case "sweeping":
+                    cut = ""
+                case "connecting" if status["why"] and not cut:
+                    cut, until_s = status["why"], time.monotonic() + AWAY_S
+                    bar.write(f"foveascan: {printable(cut)}: waiting for the scanner to come back", sys.stderr)
+                case "ready" if cut and not status["why"]:
+                    until_s = min(until_s, time.monotonic() + BACK_S)
+                case phase if phase != "connecting" and status["why"]:
+                    raise ScannerFault(status["why"])
+            if cut and time.monotonic() > until_s:
+                raise ScannerFault(cut)
 
 
 async def _ready(session: Session) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from aiohttp import web
 
-from client import NodeLost, RequestRefused, command, discovery
+from client import NodeLost, RequestRefused, command, discovery, scan_command
 from client.command import _update_line
 from client.discovery import NodeAddress
 from client.session import _checked_look
@@ -255,6 +255,27 @@ def test_a_quality_that_makes_no_sense_is_refused() -> None:
 def test_a_sweep_that_fails_says_why() -> None:
     table = Turntable({"phase": "ready"}, {"phase": "ready", "why": "sweep interrupted: the port is gone"})
     with serving_in_thread(greet_and_wait, *table.routes()) as url, pytest.raises(ScannerFault, match="port is gone"):
+        run("scan", "--node", url)
+
+
+def test_a_sweep_that_is_cut_is_waited_for(capsys: pytest.CaptureFixture[str]) -> None:
+    away = {"phase": "connecting", "why": "the line is empty"}
+    back = {"phase": "ready"}, {"phase": "sweeping"}, {"phase": "ready", "sweeps": 1}
+    table = Turntable({"phase": "ready"}, {"phase": "sweeping"}, away, away, *back)
+    with serving_in_thread(table.announce, *table.routes()) as url:
+        assert run("scan", "--node", url, "--json") == 0
+    said, told = capsys.readouterr()
+    assert [one["scan"] for one in json_lines(said)] == ["fresh"]
+    assert told == "foveascan: the line is empty: waiting for the scanner to come back\n"
+
+
+@pytest.mark.parametrize("phase", ["connecting", "ready"])
+def test_a_sweep_that_does_not_go_on_is_not_waited_for_endlessly(phase: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan_command, "AWAY_S", 0.5 if phase == "connecting" else 1e9)
+    monkeypatch.setattr(scan_command, "BACK_S", 0.5)
+    away = {"phase": "connecting", "why": "the line is empty"}
+    table = Turntable({"phase": "ready"}, away, {"phase": phase, "why": away["why"] if phase == "connecting" else ""})
+    with serving_in_thread(greet_and_wait, *table.routes()) as url, pytest.raises(ScannerFault, match="line is empty"):
         run("scan", "--node", url)
 
 
