@@ -15,11 +15,11 @@ from typing import Protocol
 
 from protocol.errors import PortLost
 from simulators.faults import Unplugged
+from simulators.pace import Pace
 
 _READ_BYTES = 65536
 PORTION_BYTES = 3000  # handed to the line at once; with a frame more, a pty takes it whole
 _BITS_PER_BYTE = 10  # start, eight data, stop
-_CATCH_UP_S = 0.02  # a sleep that came back late may be made good up to this
 
 
 
@@ -173,8 +173,7 @@ class PtyPort:
     def __init__(self, link_path: Path, baud: int = 3_000_000) -> None:
         self.name = str(link_path)
         self._link_path = link_path
-        self._rate_bytes_s = baud / _BITS_PER_BYTE
-        self._free_s = 0.0
+        self._pace = Pace(baud / _BITS_PER_BYTE)
         _check_free(link_path)
         self._wake_read, self._wake_write = os.pipe()
         self._master = self._slave = -1
@@ -214,7 +213,7 @@ class PtyPort:
                 return
             with suppress(BlockingIOError):
                 rest = rest[os.write(self._master, rest) :]
-        self._pace(len(data))
+        self._pace.wait(len(data))
 
     def cancel(self) -> None:
         """As Port.cancel."""
@@ -226,13 +225,6 @@ class PtyPort:
             self.hang_up()
         for descriptor in (self._wake_read, self._wake_write):
             os.close(descriptor)
-
-    def _pace(self, size_bytes: int) -> None:
-        """Sleep as long as the line needs for that many bytes."""
-        now_s = time.monotonic()
-        self._free_s = max(self._free_s, now_s - _CATCH_UP_S) + size_bytes / self._rate_bytes_s
-        if self._free_s > now_s:
-            time.sleep(self._free_s - now_s)
 
 
 def serve(scanner: Device, port: ServedPort, stop: threading.Event, portion_bytes: int = PORTION_BYTES) -> None:

@@ -6,12 +6,11 @@ import os
 import re
 import select
 import socket
-import time
 from contextlib import suppress
 
 from protocol.errors import UsageError
+from simulators.pace import Pace
 
-_CATCH_UP_S = 0.02
 _LISTEN = re.compile(r"(?:(?:\[([0-9A-Fa-f:.]+)\]|([^\s:\[\]/]+)):)?([0-9]{1,5})")
 
 
@@ -31,8 +30,7 @@ class TcpListener:
 
     def __init__(self, place: tuple[str, int], rate_bytes_s: float = float("inf")) -> None:
         self._place = place
-        self._rate_bytes_s = rate_bytes_s
-        self._free_s = 0.0
+        self._pace = Pace(rate_bytes_s)
         self._node: socket.socket | None = None
         self._listener: socket.socket | None = None
         self._wake_read, self._wake_write = os.pipe()
@@ -87,7 +85,7 @@ class TcpListener:
                 continue
             except OSError:
                 self._drop()
-        self._pace(len(data))
+        self._pace.wait(len(data))
 
     def cancel(self) -> None:
         """As Port.cancel."""
@@ -136,10 +134,3 @@ class TcpListener:
         if self._node is not None:
             self._node.close()
             self._node = None
-
-    def _pace(self, size_bytes: int) -> None:
-        """Sleep as long as the line needs for that many bytes."""
-        now_s = time.monotonic()
-        self._free_s = max(self._free_s, now_s - _CATCH_UP_S) + size_bytes / self._rate_bytes_s
-        if self._free_s > now_s:
-            time.sleep(self._free_s - now_s)

@@ -23,12 +23,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from simulators.pace import Pace
 from simulators.usb_descriptors import BULK_IN, BULK_OUT, UsbIdentity
 from simulators.usb_uevent import announce
 
 PRELOAD = "libumockdev-preload.so.0"
 _HOLD_S = 0.002  # how long a reap waits for news: longer holds up writes, shorter spins
-_CATCH_UP_S = 0.02
 _OUT_WAITING_BYTES = 1 << 20
 _MESSAGE = struct.Struct("<QQQ")
 _IOCTL, _DONE, _READ, _WRITE = 1, 3, 5, 6
@@ -100,8 +100,7 @@ class UsbTestbed:
         self.stalls = 0  # transfers that the device will refuse next
         self.waited_s = 0.0  # for the node to fetch what the device has to send
         self._root = root
-        self._rate_bytes_s = rate_bytes_s
-        self._free_s = 0.0
+        self._pace = Pace(rate_bytes_s)
         self._port = f"1-{place}"
         self._plugged = _Plugged(place * _NUMBERS, is_gone=True)
         self._changed = threading.Condition()
@@ -136,7 +135,7 @@ class UsbTestbed:
             self.waited_s += time.monotonic() - began_s
             self._out.append(memoryview(data))
             self._fill()
-        self._pace(len(data))
+        self._pace.wait(len(data))
 
     def cancel(self) -> None:
         """Wake who waits in read or write."""
@@ -182,13 +181,6 @@ class UsbTestbed:
 
     def _waiting_bytes(self) -> int:
         return sum(map(len, self._out))
-
-    def _pace(self, size_bytes: int) -> None:
-        """Sleep as long as the line needs for that many bytes."""
-        now_s = time.monotonic()
-        self._free_s = max(self._free_s, now_s - _CATCH_UP_S) + size_bytes / self._rate_bytes_s
-        if self._free_s > now_s:
-            time.sleep(self._free_s - now_s)
 
     # -- sysfs ---------------------------------------------------------------------------------------------------
 

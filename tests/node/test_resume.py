@@ -172,9 +172,8 @@ def test_a_whole_sweep_whose_count_had_not_come_is_counted_when_it_goes_on(
     assert is_truth(node.grids.get(timeout=WAIT_S))
 
 
-def test_complete_sweeps_of_a_crashed_node_are_published_as_they_would_have_been(
-    plug: Plug, node: Node, tmp_path: Path
-) -> None:
+def crashed(plug: Plug, node: Node) -> Grid:
+    """A node that ends before the grid of its sweep, which is returned, is taken."""
     refused: list[Grid] = []
 
     def crash(grid: Grid) -> None:
@@ -187,10 +186,17 @@ def test_complete_sweeps_of_a_crashed_node_are_published_as_they_would_have_been
     assert node.capture.request_sweep()
     node.wait_for(SweepInterrupted)
     node.capture.stop()
+    (not_taken,) = refused
+    return not_taken
+
+
+def test_complete_sweeps_of_a_crashed_node_are_published_as_they_would_have_been(
+    plug: Plug, node: Node, tmp_path: Path
+) -> None:
+    not_taken = crashed(plug, node)
     sweeps, made = Journals(tmp_path / "sweeps"), list[Assembly]()
     (said,) = publish_complete(sweeps, made.append)
     assert said.startswith("published sweep") and is_truth(made[0].grid)
-    (not_taken,) = refused
     assert content_id(made[0].grid) == content_id(not_taken)
     assert sweeps.interrupted() == [] and publish_complete(sweeps, made.append) == []
 
@@ -198,15 +204,7 @@ def test_complete_sweeps_of_a_crashed_node_are_published_as_they_would_have_been
 async def test_a_complete_sweep_of_a_crashed_node_is_told_of_as_any_when_the_node_starts(
     plug: Plug, node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def crash(grid: Grid) -> None:
-        raise LibraryError("as good as a crash")
-
-    node.deliver = crash
-    plug.plug(device())
-    node.wait_until("ready")
-    assert node.capture.request_sweep()
-    node.wait_for(SweepInterrupted)
-    node.capture.stop()
+    crashed(plug, node)
     asked: asyncio.Queue[Grid] = asyncio.Queue()
     loop = asyncio.get_running_loop()
     monkeypatch.setattr(derive, "closes", lambda grid: loop.call_soon_threadsafe(asked.put_nowait, grid) and False)
