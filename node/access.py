@@ -20,7 +20,7 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from node.durable import give_to_owner_of, read_bounded, write_whole
+from node.durable import give_to_owner_of, make_private_folder, read_bounded, write_whole
 from protocol import pairing
 from protocol.errors import AccessError, LibraryError
 
@@ -61,10 +61,8 @@ def access_folder(library: Path) -> Path:
     """Where a node keeps its certificate and who may come in; made if need be. Raises AccessError."""
     folder = library / FOLDER
     try:
-        if not folder.exists():
-            folder.mkdir(mode=0o700, parents=True)
-            give_to_owner_of(library, folder)
-        elif folder.stat().st_mode & 0o077:
+        make_private_folder(folder)
+        if folder.stat().st_mode & 0o077:
             raise AccessError(f"{folder} is open to others: chmod 700 {folder}")
     except OSError as error:
         raise AccessError(f"{folder}: {error.strerror}") from error

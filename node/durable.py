@@ -49,6 +49,20 @@ def give_to_owner_of(folder: Path, path: Path) -> None:
         os.chown(path, owner.st_uid, owner.st_gid)
 
 
+def make_private_folder(folder: Path) -> None:
+    """Make a folder that only the owner of its parent may use, unless it is there; others may do so at the same time.
+
+    Raises OSError.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True)
+    except FileExistsError:
+        if not folder.is_dir():
+            raise
+    else:
+        give_to_owner_of(folder.parent, folder)
+
+
 def read_bounded(path: Path, bytes_max: int) -> bytes:
     """The content of a small file. Raises OSError, or LibraryError when it is larger than `bytes_max`."""
     with open(path, "rb") as file:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from node.durable import give_to_owner_of, sync_folder
+from node.durable import give_to_owner_of, make_private_folder, sync_folder
 
 FILES = 8
 LOCK_FILE = "lock"
@@ -68,9 +68,7 @@ class Trail:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        if not self._folder.exists():
-            self._folder.mkdir(mode=0o700, parents=True)
-            give_to_owner_of(self._folder.parent, self._folder)
+        make_private_folder(self._folder)
         lock = self._folder / LOCK_FILE
         handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:

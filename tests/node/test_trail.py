@@ -6,6 +6,8 @@ import errno
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,20 @@ def test_the_oldest_go_when_there_are_too_many(tmp_path: Path) -> None:
     assert kept == sorted(kept, reverse=True)
     assert (kept[0], len(kept)) == (999, len(range(kept[-1], 1000)))
     assert len(kept) * 6 > bytes_max * (FILES - 2) / FILES
+
+
+def test_several_may_begin_at_once(tmp_path: Path) -> None:
+    for attempt in range(50):
+        trails = [Trail(tmp_path / str(attempt), name, 8000) for name in "abcd"]
+        start = threading.Barrier(len(trails))
+
+        def begin(trail: Trail, start: threading.Barrier = start) -> None:
+            start.wait()
+            trail.append([b"1"])
+
+        with ThreadPoolExecutor(len(trails)) as together:
+            [*together.map(begin, trails)]
+        assert [lines(trail) for trail in trails] == [[1]] * len(trails)
 
 
 def test_only_its_owner_may_read_it(tmp_path: Path) -> None:
