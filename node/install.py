@@ -37,6 +37,7 @@ PLACES = {
 }
 LAID = "laid.json"  # in PROGRAM: what we laid out, and its hash as we did
 KEPT_RELEASES = 2
+UDEV_CONTROL = Path("/run/udev/control")  # udevd listens there
 
 
 @dataclass
@@ -92,7 +93,7 @@ class Installer:
                 self._delete(self.root / place)
         if self._starts:
             self._run("systemctl", "daemon-reload")
-            self._run_if_there("udevadm", "control", "--reload")
+            self._udevadm("control", "--reload")
             if purge and shutil.which("userdel"):
                 self._run("userdel", ACCOUNT)
         if not purge:
@@ -174,8 +175,8 @@ class Installer:
     def _bring_up(self) -> None:
         self._run("systemd-sysusers", f"/{PLACES['sysusers.conf']}")
         self._run("systemd-tmpfiles", "--create", f"/{PLACES['tmpfiles.conf']}")
-        self._run_if_there("udevadm", "control", "--reload")
-        self._run_if_there("udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=usb")
+        self._udevadm("control", "--reload")
+        self._udevadm("trigger", "--subsystem-match=tty", "--subsystem-match=usb")
         self._run("systemctl", "daemon-reload")
         self._run("systemctl", "enable", SERVICE)
         self._run("systemctl", "restart", SERVICE)
@@ -242,9 +243,9 @@ class Installer:
         else:
             path.unlink()
 
-    def _run_if_there(self, *command: str) -> None:
-        if shutil.which(command[0]):
-            self._run(*command)
+    def _udevadm(self, *command: str) -> None:
+        if UDEV_CONTROL.exists():  # a container may have the command and no udevd
+            self._run("udevadm", *command)
 
     def _run(self, *command: str) -> None:
         self.tell(f"run      {' '.join(command)}")
