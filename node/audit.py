@@ -12,6 +12,7 @@ Refusals have files of their own, so that no stranger can push out what those di
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from collections import OrderedDict, deque
@@ -38,6 +39,7 @@ SEEN_MAX = 4096
 REFUSALS, REFUSALS_S = 100, 10.0  # so many are written down within so long, the others are counted
 WHAT_MAX = 300
 TIME = "0000-00-00T00:00:00.000Z"
+BEGINS_A_TIME = "^" + "".join(f"([{'0-9' if char == '0' else char}]" for char in TIME) + ")?" * len(TIME) + "$"
 
 Event = Literal[
     "started", "stopped", "listed", "watched", "opened", "seen", "read", "exported", "imported", "scanned", "derived",
@@ -224,9 +226,7 @@ def refused_trail(library: Path) -> Trail:
 
 def begins_a_time(text: str) -> bool:
     """Whether an `Entry.at` could begin so."""
-    return len(text) <= len(TIME) and all(
-        char in "0123456789" if place == "0" else char == place for char, place in zip(text, TIME, strict=False)
-    )
+    return re.fullmatch(BEGINS_A_TIME, text) is not None
 
 
 def read_trail(trail: Trail, *, since: str = "", scan: str = "", by: str = "") -> Iterator[Entry]:

@@ -1,9 +1,8 @@
 """Who may do what. The one place where logins stand: every request passes `Auth.admit`, streams too.
 
 A login is a token (node.access), shown as `Authorization: Bearer`, as the subprotocol `foveascan.token.<token>` of a
-stream, or as a cookie that the pairing page set. Who shows none may ask what is PUBLIC and nothing else; a role that is
-more than view is asked for where the work is done, by `require`; who has the role monitor may ask what is MONITORED and
-nothing else. A node with --insecure, which serves loopback only, lets everybody do everything.
+stream, or as a cookie that the pairing page set. Which role a request needs is in the table of `node.endpoints`; what
+is not there needs `OTHERWISE`. A node with --insecure, which serves loopback only, lets everybody do everything.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from node.access import Access, Token
 from node.attempts import Attempts
 from node.audit import Who
 from node.config import is_loopback
+from node.endpoints import endpoint_of, place_of
 from protocol.errors import AccessError
 from protocol.pairing import Role as Role
 
@@ -32,8 +32,7 @@ log = logging.getLogger(__name__)
 COOKIE = "__Host-foveascan"
 SUBPROTOCOL = "foveascan.token."
 STREAM = "/v1/stream"
-PUBLIC = frozenset({"/assets/{name}", "/healthz", "/pair", "/v1/pair"})
-MONITORED = PUBLIC | {"/metrics"}
+OTHERWISE: Role = "view"  # so nobody finds out what there is not
 CHALLENGE = {"WWW-Authenticate": "Bearer"}
 SAFE = frozenset({"GET", "HEAD"})
 RANK: dict[Role | None, int] = {None: -1, "monitor": 0, "view": 1, "operate": 2, "admin": 3}
@@ -76,10 +75,11 @@ class Auth:
         request[LOGIN] = NOBODY
         self._check_origin(request)
         request[LOGIN] = login = self._identify(request)
-        place = place_of(request)
-        if login.role is None and place == "/":
-            raise web.HTTPSeeOther("/pair")
-        if login.role is None and place not in PUBLIC:
+        place, endpoint = place_of(request), endpoint_of(request)
+        least = endpoint.role if endpoint else OTHERWISE
+        if login.role is None and least is not None:
+            if place == "/":
+                raise web.HTTPSeeOther("/pair")
             self._refused(asker(request), "no token", f"{request.method} {place}")
             raise web.HTTPUnauthorized(text="this node wants a login: pair with it first")
         task = asyncio.current_task()
@@ -87,8 +87,8 @@ class Auth:
         if place != STREAM:
             self._at_work[task] = login
         try:
-            if login.role == "monitor" and place not in MONITORED:
-                require(request, "view")
+            if RANK[login.role] < RANK[least]:
+                raise web.HTTPForbidden(text=f"this needs the role {least}")
             return await handler(request)
         except web.HTTPForbidden:
             self._refused(asker(request), "role", f"{request.method} {place}")
@@ -155,18 +155,6 @@ def asker(request: web.Request) -> Who:
     """Whoever asks, for the audit log."""
     login = request[LOGIN]
     return Who(login.name, login.role or "", request.remote or "")
-
-
-def place_of(request: web.Request) -> str:
-    """Which route a request takes, as README's table has it; "" for one that leads nowhere."""
-    resource = request.match_info.route.resource
-    return resource.canonical if resource else ""
-
-
-def require(request: web.Request, role: Role) -> None:
-    """Raise 403 unless whoever asks has at least this role."""
-    if RANK[request[LOGIN].role] < RANK[role]:
-        raise web.HTTPForbidden(text=f"this needs the role {role}")
 
 
 def _token_shown(request: web.Request) -> str | None:

@@ -11,50 +11,34 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Annotated
 
-import msgspec
 from aiohttp import web
-from msgspec import Meta, Struct
 
 from exchange.closing import closes
 from exchange.errors import ExchangeError
 from exchange.formats import ReadOptions, as_wanted
 from exchange.native import Scanned
-from exchange.sweeps import TIP_DEG, Sweep
+from exchange.sweeps import Sweep
+from node import bodies
 from node.audit import NODE, Audit
 from node.audit_routes import SCAN, WHAT
-from node.auth import require
+from node.endpoints import route
 from node.exhibits import Exhibits
 from node.library import About, Library, Scan
+from node.rest import decoded, said
 from protocol import messages as m
 from protocol.errors import LibraryError
-from protocol.grid import Geometry
 
 log = logging.getLogger(__name__)
 
 AT_ONCE = 1
 
 
-class Wanted(Struct, frozen=True, forbid_unknown_fields=True, rename="camel"):
-    """What a scan is to become. caps, centre_height_mm : of a sphere, as exchange.formats.ReadOptions has them.
-
-    top, bottom : ids of scans of the same object, tipped by tip_deg over its front, and over its back.
-    """
-
-    geometry: Geometry
-    caps: bool = False
-    centre_height_mm: Annotated[float, Meta(ge=-1e6, le=1e6)] | None = None
-    top: Annotated[str, Meta(max_length=200)] | None = None
-    bottom: Annotated[str, Meta(max_length=200)] | None = None
-    tip_deg: Annotated[float, Meta(ge=0, le=180)] = TIP_DEG
-
-
 class Stopping(Exception):
     """The node ends, and with it what it was working on."""
 
 
-def derive(library: Library, scan_id: str, wanted: Wanted, progress: Callable[[float], object]) -> Scan:
+def derive(library: Library, scan_id: str, wanted: bodies.Derivation, progress: Callable[[float], object]) -> Scan:
     """Make a scan of a scan, safe on disk before this returns. progress : told the share done; may raise.
 
     Raises LibraryError for one that is unknown or cannot be kept, ExchangeError for one that cannot be made so.
@@ -76,7 +60,7 @@ def derive(library: Library, scan_id: str, wanted: Wanted, progress: Callable[[f
     return library.add(made.grid, about)
 
 
-def _tipped(wanted: Wanted) -> Iterator[tuple[str, float]]:
+def _tipped(wanted: bodies.Derivation) -> Iterator[tuple[str, float]]:
     """The other sweeps that are wanted, and how far the object was tipped over its front in each."""
     if wanted.top is not None:
         yield wanted.top, wanted.tip_deg
@@ -100,7 +84,7 @@ class Derivation:
 
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
-        return [web.post("/v1/scans/{scan}/derive", self._derive)]
+        return [route("POST /v1/scans/{scan}/derive", self._derive)]
 
     def consider(self, scan_id: str) -> None:
         """Make a sphere of a new sweep, if it saw a closed object; later, beside everything else."""
@@ -118,7 +102,7 @@ class Derivation:
         async with self._place:
             try:
                 if await asyncio.to_thread(lambda: closes(library.open(scan_id).grid)):
-                    scan = await self._made(scan_id, Wanted("sphere"))
+                    scan = await self._made(scan_id, bodies.Derivation("sphere"))
                     self._audit.note("derived", NODE, scan=scan.id, what=f"of {scan_id}")
                     log.info("scan published, too: %s", scan.about.note)
             except (ExchangeError, LibraryError) as problem:
@@ -127,8 +111,7 @@ class Derivation:
                 pass
 
     async def _derive(self, request: web.Request) -> web.Response:
-        require(request, "operate")
-        wanted = _decoded(await request.read())
+        wanted = decoded(await request.read(), bodies.Derivation)
         if self._place.locked():
             raise web.HTTPServiceUnavailable(text="busy with another scan: try again later")
         async with self._place:
@@ -140,10 +123,9 @@ class Derivation:
             except Stopping:
                 raise web.HTTPServiceUnavailable(text="the node is stopping") from None
         request[SCAN], request[WHAT] = scan.id, f"of {source}"
-        said = {"id": scan.id, "geometry": scan.spec.geometry, "note": scan.about.note}
-        return web.Response(body=msgspec.json.encode(said), content_type="application/json", status=201)
+        return said(bodies.Derived(scan.id, scan.spec.geometry, scan.about.note), 201)
 
-    async def _made(self, scan_id: str, wanted: Wanted) -> Scan:
+    async def _made(self, scan_id: str, wanted: bodies.Derivation) -> Scan:
         scan = await asyncio.to_thread(derive, self._exhibits.library, scan_id, wanted, self._go_on)
         self._published(m.Published(scan.id, made_from=scan.about.made_from))
         return scan
@@ -151,10 +133,3 @@ class Derivation:
     def _go_on(self, share: float) -> None:
         if self._stopping.is_set():
             raise Stopping
-
-
-def _decoded(body: bytes) -> Wanted:
-    try:
-        return msgspec.json.decode(body, type=Wanted)
-    except (msgspec.DecodeError, UnicodeDecodeError) as problem:
-        raise web.HTTPBadRequest(text=f"derive: {problem}") from problem

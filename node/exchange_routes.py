@@ -13,17 +13,18 @@ import time
 from collections.abc import Callable
 from typing import BinaryIO
 
-import msgspec
 from aiohttp import ClientError, web
 
 from exchange.errors import ExchangeError
 from exchange.formats import MEDIA_TYPES, writer_of
 from exchange.native import Scanned, read_native, write_native
 from node.audit_routes import SCAN
-from node.auth import require
+from node.bodies import Kept
+from node.endpoints import route
 from node.exhibits import Exhibits
 from node.library import About, Scan
 from node.library_routes import explained
+from node.rest import said
 from node.spool import CHUNK_BYTES, STALL_S, disk_trouble, send, spool
 from protocol import messages as m
 
@@ -31,7 +32,6 @@ IMPORT_BYTES_MAX = 1 << 29
 ARRAY_BYTES_MAX = 1 << 28
 EXPORTS_MAX = 2
 SLOWEST_BYTES_S = 16384  # who sends slower for long keeps the one place for imports from others
-FORMATS = "|".join(suffix.removeprefix(".").replace(".", r"\.") for suffix in MEDIA_TYPES)
 
 
 class ExchangeRoutes:
@@ -46,8 +46,8 @@ class ExchangeRoutes:
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application, before any route that takes /v1/scans/{anything}."""
         return [
-            web.get(rf"/v1/scans/{{scan:[^./]+}}.{{format:{FORMATS}}}", self._export),
-            web.post("/v1/scans", self._import),
+            route("GET /v1/scans/{scan}.{format}", self._export),
+            route("POST /v1/scans", self._import),
         ]
 
     async def _export(self, request: web.Request) -> web.StreamResponse:
@@ -62,7 +62,6 @@ class ExchangeRoutes:
                 return await send(request, file, f"{scan_id}{suffix}", MEDIA_TYPES[suffix])
 
     async def _import(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         _check_free(self._importing)
         async with self._importing:
             with spool(self._exhibits.library.folder) as file:
@@ -72,8 +71,7 @@ class ExchangeRoutes:
             scan = await self._keep(found)
         request[SCAN] = scan.id
         self._published(m.Published(scan.id))
-        body, status = msgspec.json.encode({"id": scan.id}), 200 if scan.id in before else 201
-        return web.Response(body=body, content_type="application/json", status=status)
+        return said(Kept(scan.id), 200 if scan.id in before else 201)
 
     async def _keep(self, found: Scanned) -> Scan:
         with explained():

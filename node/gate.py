@@ -28,9 +28,10 @@ from aiohttp import ClientError, web
 from aiohttp.typedefs import Handler
 
 from node.attempts import place_of_address
-from node.auth import STREAM, place_of
+from node.auth import STREAM
 from node.bucket import Buckets, whole_seconds
 from node.config import Limits
+from node.endpoints import place_of
 
 log = logging.getLogger(__name__)
 

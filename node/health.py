@@ -15,6 +15,8 @@ from node.scan_folder import name_problems
 STUCK_S = 30.0  # the slowest step of the capture thread takes 15
 ENDS_SOON_S = 14 * 86400.0
 
+Status = Literal["ready", "capturing", "degraded", "stopping"]
+
 
 @dataclass(frozen=True, slots=True)
 class Health:
@@ -24,7 +26,7 @@ class Health:
     reasons : why it is not ready.
     """
 
-    status: Literal["ready", "capturing", "degraded", "stopping"]
+    status: Status
     reasons: tuple[str, ...] = ()
 
 

@@ -10,19 +10,20 @@ import asyncio
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 
-import msgspec
 from aiohttp import web
 
 from node.audit import Audit
-from node.auth import LOGIN, require
+from node.auth import LOGIN
+from node.bodies import HealthSaid
 from node.capture import Capture, CaptureStatus, SweepCounts
+from node.endpoints import route
 from node.exhibits import Exhibits
 from node.gate import Gate
 from node.health import Health, examine_health
 from node.metrics import MEDIA_TYPE, Metrics, Now
 from node.notify import Beating
+from node.rest import said
 from node.tls import Tls
 
 
@@ -52,19 +53,16 @@ class HealthRoutes:
 
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
-        return [web.get("/healthz", self._health), web.get("/metrics", self._show)]
+        return [route("GET /healthz", self._health), route("GET /metrics", self._show)]
 
     async def _health(self, request: web.Request) -> web.Response:
         health = await asyncio.to_thread(self._examine)
         status = 503 if health.status == "stopping" else 200
         if request[LOGIN].role is None:
-            said: dict[str, object] = {"status": health.status}
-        else:
-            said = {**asdict(health), "capture": asdict(self._status())}
-        return web.Response(body=msgspec.json.encode(said), content_type="application/json", status=status)
+            return said(HealthSaid(health.status), status)
+        return said(HealthSaid(health.status, health.reasons, self._status()), status)
 
     async def _show(self, request: web.Request) -> web.Response:
-        require(request, "monitor")
         body = await asyncio.to_thread(self._metrics.exposition)
         return web.Response(body=body, headers={"Content-Type": MEDIA_TYPE})
 

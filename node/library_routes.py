@@ -21,16 +21,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
 
-import msgspec
 from aiohttp import web
 
 from node.audit_routes import SCAN, WHAT
-from node.auth import LOGIN, require
+from node.auth import LOGIN
+from node.bodies import ListedSweep, Verified
 from node.capture import Capture, CaptureStatus
 from node.durable import NoRoom
+from node.endpoints import route
 from node.journal import Interrupted
 from node.library import Library, verify
 from node.partial import write_partial
+from node.rest import said
 from node.sidecar import BY_MAX, Conflict, Sidecar, changed_fields, decode_changes
 from node.spool import send, spool
 from protocol.errors import LibraryError
@@ -52,14 +54,14 @@ class LibraryRoutes:
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
         return [
-            web.get("/v1/scans/{scan}/sidecar", self._sidecar),
-            web.patch("/v1/scans/{scan}/sidecar", self._annotate),
-            web.post("/v1/scans/{scan}/verify", self._verify),
-            web.delete("/v1/scans/{scan}", self._delete),
-            web.get("/v1/sweeps", self._sweeps),
-            web.post("/v1/sweeps/{sweep}/resume", self._resume),
-            web.get("/v1/sweeps/{sweep:[0-9a-f]+}.npz", self._export_sweep),
-            web.delete("/v1/sweeps/{sweep}", self._delete_sweep),
+            route("GET /v1/scans/{scan}/sidecar", self._sidecar),
+            route("PATCH /v1/scans/{scan}/sidecar", self._annotate),
+            route("POST /v1/scans/{scan}/verify", self._verify),
+            route("DELETE /v1/scans/{scan}", self._delete),
+            route("GET /v1/sweeps", self._sweeps),
+            route("POST /v1/sweeps/{sweep}/resume", self._resume),
+            route("GET /v1/sweeps/{sweep}.npz", self._export_sweep),
+            route("DELETE /v1/sweeps/{sweep}", self._delete_sweep),
         ]
 
     # -- scans -----------------------------------------------------------------------------------------------------
@@ -67,25 +69,22 @@ class LibraryRoutes:
     async def _sidecar(self, request: web.Request) -> web.Response:
         scan_id = self._known(request)
         with explained():
-            return _said(await asyncio.to_thread(self._library.sidecar, scan_id))
+            return _tagged(await asyncio.to_thread(self._library.sidecar, scan_id))
 
     async def _annotate(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         scan_id, revision = self._named(request), _revision(request)
         with explained():
             changes = decode_changes(await request.read())
             request[WHAT] = ", ".join(changed_fields(changes))
             by = f"{request[LOGIN].name} at {request.remote}"[:BY_MAX]
-            return _said(await asyncio.to_thread(self._library.annotate, scan_id, changes, by, revision))
+            return _tagged(await asyncio.to_thread(self._library.annotate, scan_id, changes, by, revision))
 
     async def _verify(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         scan_id = self._known(request)
         ((_, problem),) = await asyncio.to_thread(lambda: list(verify(self._library.folder, [scan_id])))
-        return _json({"id": scan_id, "sound": problem is None, "reason": problem.reason if problem else ""})
+        return said(Verified(scan_id, problem is None, problem.reason if problem else ""))
 
     async def _delete(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         scan_id = self._named(request)
         with explained():
             await asyncio.to_thread(self._library.delete, scan_id)
@@ -111,18 +110,16 @@ class LibraryRoutes:
     # -- sweeps ----------------------------------------------------------------------------------------------------
 
     async def _sweeps(self, request: web.Request) -> web.Response:
-        return _json([_summary(sweep) for sweep in self._library.sweeps.interrupted()])
+        return said([_listed(sweep) for sweep in self._library.sweeps.interrupted()])
 
     async def _resume(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         sweep = self._interrupted(request)
         if self._capture is None or not self._capture.request_resume(sweep.id):
             status = self._capture.status if self._capture else CaptureStatus("no scanner")
             raise web.HTTPConflict(text=status.refusal or "the scanner was busy: try again")
-        return _json(_summary(sweep), status=202)
+        return said(_listed(sweep), status=202)
 
     async def _delete_sweep(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         sweep = self._interrupted(request)
         with explained():
             await asyncio.to_thread(self._library.sweeps.delete, sweep.id)
@@ -173,21 +170,16 @@ def _revision(request: web.Request) -> int | None:
     return int(match[1])
 
 
-def _said(sidecar: Sidecar) -> web.Response:
-    response = _json(sidecar)
+def _tagged(sidecar: Sidecar) -> web.Response:
+    response = said(sidecar)
     response.headers["ETag"] = f'"{sidecar.revision}"'
     return response
 
 
-def _summary(sweep: Interrupted) -> dict[str, object]:
+def _listed(sweep: Interrupted) -> ListedSweep:
     s = sweep.header.spec
-    return {
-        "id": sweep.id, "started": sweep.started_unix_s, "ended": sweep.ended_unix_s, "why": sweep.why,
-        "held": sweep.held, "expected": sweep.expected, "complete": sweep.is_complete,
-        "damagedBytes": sweep.damaged_bytes, "sizeBytes": sweep.size_bytes, "scanner": sweep.info.serial_number,
-        "width": s.width, "height": s.height, "textureWidth": s.texture_width, "textureHeight": s.texture_height,
-    }  # fmt: skip
-
-
-def _json(value: object, status: int = 200) -> web.Response:
-    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
+    return ListedSweep(
+        sweep.id, sweep.started_unix_s, sweep.ended_unix_s, sweep.why, sweep.held, sweep.expected, sweep.is_complete,
+        sweep.damaged_bytes, sweep.size_bytes, sweep.info.serial_number,
+        s.width, s.height, s.texture_width, s.texture_height,
+    )  # fmt: skip

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from aiohttp import web
 
+from node.endpoints import route
+
 DIST = Path(__file__).resolve().parents[1] / "client" / "viewer" / "dist"
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -44,7 +46,7 @@ class Page:
 
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
-        return [web.get("/", self._page), web.get("/assets/{name}", self._asset)]
+        return [route("GET /", self._page), route("GET /assets/{name}", self._asset)]
 
     async def _page(self, request: web.Request) -> web.Response:
         page = self._files.get("index.html")

@@ -18,15 +18,16 @@ import html
 import logging
 import time
 from collections.abc import Callable
-from typing import Any
 
-import msgspec
 from aiohttp import web
 
 from node.access import Access, Token
 from node.attempts import Attempts
 from node.audit import NODE, Audit, Who
-from node.auth import COOKIE, Refusal, asker, require
+from node.auth import COOKIE, Refusal, asker
+from node.bodies import ListedToken, NewCode, Offered
+from node.endpoints import route
+from node.rest import decoded, refusal, said
 from node.tls import Tls
 from protocol import pairing
 from protocol.errors import AccessError, LocalWireError
@@ -59,13 +60,6 @@ autocapitalize="characters" spellcheck="false" maxlength="40" placeholder="ABCD-
 """
 
 
-class NewCode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of POST /v1/codes."""
-
-    name: pairing.Name
-    role: pairing.Role = "view"
-
-
 class PairingRoutes:
     """The routes above. access, tls : None without login. audit : told who is let in and put out.
 
@@ -94,11 +88,11 @@ class PairingRoutes:
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
         return [
-            web.get("/pair", self._page),
-            web.post("/v1/pair", self._pair),
-            web.post("/v1/codes", self._offer),
-            web.get("/v1/tokens", self._tokens),
-            web.delete("/v1/tokens/{name}", self._revoke),
+            route("GET /pair", self._page),
+            route("POST /v1/pair", self._pair),
+            route("POST /v1/codes", self._offer),
+            route("GET /v1/tokens", self._tokens),
+            route("DELETE /v1/tokens/{name}", self._revoke),
         ]
 
     # -- pairing ---------------------------------------------------------------------------------------------------
@@ -114,13 +108,13 @@ class PairingRoutes:
         if self._failures.is_locked(request.remote or "", time.monotonic()):
             log.warning("pairing: %s is locked", request.remote)
             self._refused(asker(request), "locked", "too many wrong codes")
-            locked = self._show(LOCKED, 429) if by_form else _refusal(429, LOCKED)
+            locked = self._show(LOCKED, 429) if by_form else refusal(429, LOCKED)
             locked.headers["Retry-After"] = f"{WITHIN_S:.0f}"
             return locked
         return await (self._pair_browser(request, access) if by_form else self._pair_client(request, access, tls, body))
 
     async def _pair_client(self, request: web.Request, access: Access, tls: Tls, body: bytes) -> web.Response:
-        asked = _decoded(body, pairing.PairRequest)
+        asked = decoded(body, pairing.PairRequest)
         own = tls.fingerprint
 
         def is_proven(key: bytes) -> bool:
@@ -129,11 +123,11 @@ class PairingRoutes:
         made = await asyncio.to_thread(access.redeem, is_proven, time.time())
         if made is None:
             await self._failed(request, access)
-            return _refusal(403, REFUSED)
+            return refusal(403, REFUSED)
         text, token, key = made
         self._paired(request, token)
         proof = pairing.node_proof(key, own, asked.nonce, text, token.role)
-        return _json(pairing.Paired(text, token.name, token.role, self._node_id, proof))
+        return said(pairing.Paired(text, token.name, token.role, self._node_id, proof))
 
     async def _pair_browser(self, request: web.Request, access: Access) -> web.Response:
         form = await request.post()
@@ -180,23 +174,20 @@ class PairingRoutes:
     # -- looking after it ------------------------------------------------------------------------------------------
 
     async def _offer(self, request: web.Request) -> web.Response:
-        require(request, "admin")
         access, tls = self._known()
-        asked = _decoded(await _bounded(request), NewCode)
+        asked = decoded(await _bounded(request), NewCode)
         try:
             code = await asyncio.to_thread(access.offer, asked.role, asked.name, time.time())
         except AccessError as error:
             raise web.HTTPConflict(text=str(error)) from error
         self._audit.note("code offered", asker(request), what=f"{asked.name}: {asked.role}")
-        return _json({"code": code, "fingerprint": tls.fingerprint}, 201)
+        return said(Offered(code, tls.fingerprint), 201)
 
     async def _tokens(self, request: web.Request) -> web.Response:
-        require(request, "admin")
         access, _ = self._known()
-        return _json([{"name": t.name, "role": t.role, "created": t.created_unix_s} for t in access.tokens()])
+        return said([ListedToken(token.name, token.role, token.created_unix_s) for token in access.tokens()])
 
     async def _revoke(self, request: web.Request) -> web.Response:
-        require(request, "admin")
         access, _ = self._known()
         name = request.match_info["name"]
         if not await asyncio.to_thread(access.revoke, name):
@@ -219,19 +210,3 @@ async def _bounded(request: web.Request) -> bytes:
     if len(body) > BODY_MAX_BYTES:
         raise web.HTTPRequestEntityTooLarge(BODY_MAX_BYTES, len(body))
     return body
-
-
-def _decoded(body: bytes, kind: type[Any]) -> Any:
-    try:
-        return msgspec.json.decode(body, type=kind)
-    except (msgspec.DecodeError, UnicodeError) as error:
-        raise web.HTTPBadRequest(text=str(error)) from None
-
-
-def _json(value: object, status: int = 200) -> web.Response:
-    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
-
-
-def _refusal(status: int, why: str) -> web.Response:
-    code = {403: "forbidden", 429: "too many requests"}[status]
-    return _json({"code": code, "message": why}, status)

@@ -8,21 +8,22 @@ import secrets
 import socket
 import time
 from dataclasses import asdict
-from typing import cast
 
-import msgspec
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler
+from msgspec import structs
 
 from node.access import Access
 from node.audit import NODE, Audit, Who
 from node.audit_routes import SCAN, AuditRoutes
-from node.auth import CHALLENGE, LOGIN, Auth, Refusal, place_of, require
+from node.auth import CHALLENGE, LOGIN, Auth, Refusal
+from node.bodies import CoarseQuery, ListedScan, NodeStatus, ScanDetail, SweepAsked
 from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection, House
 from node.derive import Derivation
 from node.durable import NoRoom
+from node.endpoints import place_of, route
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
@@ -32,10 +33,11 @@ from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
 from node.live import Live
 from node.metrics import Metrics
+from node.openapi import described
 from node.page import Page
 from node.pairing import PairingRoutes
 from node.proxy import believe
-from node.refine_texture import CODECS
+from node.rest import query_of, refusal, said
 from node.retention import delete, expired_in
 from node.shared import SharedFoveae
 from node.tls import Tls
@@ -112,12 +114,13 @@ class NodeServer:
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
         self._app.add_routes([
             *Page().routes(),
-            web.get("/v1/node", self._node),
-            web.get("/v1/scans", self._scans),
-            web.get("/v1/scans/{scan}", self._scan),
-            web.get("/v1/scans/{scan}/coarse", self._coarse),
-            web.post("/v1/sweeps", self._sweep),
-            web.get("/v1/stream", self._stream),
+            route("GET /openapi.json", self._describe),
+            route("GET /v1/node", self._node),
+            route("GET /v1/scans", self._scans),
+            route("GET /v1/scans/{scan}", self._scan),
+            route("GET /v1/scans/{scan}/coarse", self._coarse),
+            route("POST /v1/sweeps", self._sweep),
+            route("GET /v1/stream", self._stream),
             *self._shared.routes(),
             *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
             *self.derivation.routes(),
@@ -271,43 +274,40 @@ class NodeServer:
 
     # -- what may be asked -----------------------------------------------------------------------------------------
 
+    async def _describe(self, request: web.Request) -> web.Response:
+        return web.Response(body=described(self._info.version), content_type="application/json")
+
     async def _node(self, request: web.Request) -> web.Response:
-        problems = [asdict(problem) for problem in self._exhibits.library.problems]
-        node = msgspec.to_builtins(self._info)
-        status = {
-            "capture": asdict(self._capture_status()),
-            "sharedEncodes": self._shared.encodes,
-            "surveying": self._exhibits.surveying,
-        }
-        return _json({**node, **status, "problems": problems})
+        node = NodeStatus(
+            **structs.asdict(self._info), capture=self._capture_status(), problems=self._exhibits.library.problems,
+            shared_encodes=self._shared.encodes, surveying=self._exhibits.surveying,
+        )  # fmt: skip
+        return said(node)
 
     async def _scans(self, request: web.Request) -> web.Response:
-        return _json([_summary(scan) for scan in self._exhibits.library.scans()])
+        return said([_listed(scan) for scan in self._exhibits.library.scans()])
 
     async def _scan(self, request: web.Request) -> web.Response:
         scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
         request[SCAN] = scan.id
-        quality = scan.about.quality
-        said = quality and m.ScanQuality(**asdict(quality), complaints=quality.complaints)
-        made = {"note": scan.about.note, "madeFrom": scan.about.made_from}
-        return _json({**msgspec.to_builtins(scan_info(scan)), "quality": said, **made})
+        found = scan.about.quality
+        quality = m.ScanQuality(**asdict(found), complaints=found.complaints) if found else None
+        known = structs.asdict(scan_info(scan))
+        return said(ScanDetail(**known, quality=quality, note=scan.about.note, made_from=scan.about.made_from))
 
     async def _coarse(self, request: web.Request) -> web.Response:
         """The first view as its two refinements, one behind the other, each behind its length (u32, little-endian)."""
-        codec = request.query.get("codec", "htj2k")
-        if codec not in CODECS:
-            raise web.HTTPBadRequest(text=f"codec must be one of {', '.join(CODECS)}")
-        scan, view = await self._exhibits.open(request.match_info["scan"], cast("m.CodecName", codec))
+        codec = query_of(request, CoarseQuery).codec
+        scan, view = await self._exhibits.open(request.match_info["scan"], codec)
         request[SCAN] = scan.id
         body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
         headers = self._shared.cache_headers(request, scan)
         return web.Response(body=body, content_type="application/octet-stream", headers=headers)
 
     async def _sweep(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         if self._capture is None or not (number := self._capture.request_sweep()):
             raise web.HTTPConflict(text=self._capture_status().refusal or "the scanner was busy: try again")
-        return _json(asdict(self._capture_status()) | {"sweep": number}, status=202)
+        return said(SweepAsked(**asdict(self._capture_status()), sweep=number), 202)
 
     async def _stream(self, request: web.Request) -> web.WebSocketResponse:
         if len(self._connections) >= self._config.server.max_clients:
@@ -340,17 +340,12 @@ class NodeServer:
         return self._capture.status if self._capture else CaptureStatus("no scanner")
 
 
-def _summary(scan: ScanSummary) -> dict[str, object]:
-    s = scan.spec
-    return {
-        "id": scan.id, "created": scan.about.created_unix_s, "source": scan.about.source, "name": scan.about.name,
-        "width": s.width, "height": s.height, "textureWidth": s.texture_width, "textureHeight": s.texture_height,
-        "geometry": s.geometry, "madeFrom": scan.about.made_from, "subject": scan.subject, "bodySite": scan.body_site,
-    }  # fmt: skip
-
-
-def _json(value: object, status: int = 200) -> web.Response:
-    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)
+def _listed(scan: ScanSummary) -> ListedScan:
+    s, about = scan.spec, scan.about
+    return ListedScan(
+        scan.id, about.created_unix_s, about.source, about.name, s.width, s.height, s.texture_width, s.texture_height,
+        s.geometry, about.made_from, scan.subject, scan.body_site,
+    )  # fmt: skip
 
 
 def _bound_buffers(transport: asyncio.Transport) -> None:
@@ -376,31 +371,27 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
     try:
         return await handler(request)
     except NoRoom as error:
-        return _refusal(507, "insufficient storage", str(error))
+        return refusal(507, str(error))
     except LibraryError as error:
-        return _refusal(404, "not found", str(error))
+        return refusal(404, str(error))
     except AccessError as error:
         log.error("%s", error)
-        return _refusal(503, "service unavailable", "who may come in cannot be read")
+        return refusal(503, "who may come in cannot be read")
     except web.HTTPException as error:
         if error.status < 400:
             raise
-        refusal = _refusal(error.status, error.reason.lower(), _what(request, error))
-        refusal.headers.update({name: error.headers[name] for name in KEPT_HEADERS if name in error.headers})
+        answer = refusal(error.status, _what(request, error))
+        answer.headers.update({name: error.headers[name] for name in KEPT_HEADERS if name in error.headers})
         if error.status == 401:
-            refusal.headers.update(CHALLENGE)
-        return refusal
+            answer.headers.update(CHALLENGE)
+        return answer
     except Exception as error:
         if isinstance(error, ConnectionError) or ANSWERED in request:
             raise  # nobody is there to be told, or half an answer is on its way
         incident = secrets.token_hex(4)
         where = f"{request.method} {place_of(request)}"
         log.error("incident %s: %s: %s: %s", incident, where, type(error).__name__, error)
-        return _refusal(500, "internal server error", f"the node has failed at this: its log says how, at {incident}")
-
-
-def _refusal(status: int, code: str, message: str) -> web.Response:
-    return _json({"code": code, "message": message}, status)
+        return refusal(500, f"the node has failed at this: its log says how, at {incident}")
 
 
 def _what(request: web.Request, error: web.HTTPException) -> str:

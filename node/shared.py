@@ -24,19 +24,21 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-import msgspec
 from aiohttp import web
+from msgspec import UNSET, structs
 
 from node.audit_routes import SCAN
-from node.auth import require
+from node.bodies import FoveaQuery
 from node.coded import Coded
+from node.endpoints import route
 from node.exhibits import Exhibits
 from node.first_view import FirstView
 from node.foveate import plan_update
 from node.library import Scan
 from node.proxy import IS_PROXIED
 from node.refine_range import code_range_lattice
-from node.refine_texture import CODECS, code_texture_lattice
+from node.refine_texture import code_texture_lattice
+from node.rest import query_of
 from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.errors import CodecError, LatticeError, LibraryError
@@ -46,7 +48,6 @@ from protocol.refinement import from_spacing_byte, spacing_byte
 PLANS_KEPT = 1024
 BODIES_KEPT = 256
 MAX_AGE_S = 86400
-QUERY_KEYS = {"u", "v", "window", "texture_db", "range_mm", "max_bytes", "alpha", "scale", "codec"}
 NONE = "-"
 ORIGINAL_URI = "X-Original-URI"
 KEPT = re.compile(r"/v1/scans/([0-9a-f]{32})/(?:coarse|fovea/([0-9a-f]{8})/[0-9.-]+/[0-9.-]+)(?:\?[^#]*)?")
@@ -105,9 +106,9 @@ class SharedFoveae:
     def routes(self) -> list[web.RouteDef]:
         """What to serve."""
         return [
-            web.get("/v1/scans/{scan}/fovea", self._plan),
-            web.get("/v1/scans/{scan}/fovea/{epoch}/{range}/{texture}", self._serve),
-            web.get("/v1/auth", self.may_hand_out),
+            route("GET /v1/scans/{scan}/fovea", self._plan),
+            route("GET /v1/scans/{scan}/fovea/{epoch}/{range}/{texture}", self._serve),
+            route("GET /v1/auth", self.may_hand_out),
         ]
 
     def void(self) -> None:
@@ -118,7 +119,6 @@ class SharedFoveae:
 
     async def may_hand_out(self, request: web.Request) -> web.Response:
         """A cache asks, before it hands out what it keeps: whether this client may have it, and it is still true."""
-        require(request, "view")
         kept = KEPT.fullmatch(request.headers.get(ORIGINAL_URI, ""))
         if kept is None or not self._stands(kept):
             raise web.HTTPForbidden(text=f"{ORIGINAL_URI} names nothing that a cache may hand out")
@@ -135,8 +135,8 @@ class SharedFoveae:
             return False
 
     async def _plan(self, request: web.Request) -> web.Response:
-        require(request, "view")
-        look, codec = _asked(request)
+        query = query_of(request, FoveaQuery)
+        look, codec = _look(query), query.codec
         scan, view = await self._exhibits.open(request.match_info["scan"], codec)
         key = f"{scan.id}?{request.query_string}"
         place = await self._plans.get(key, partial(self._make_plan, scan, view, look, codec))
@@ -152,7 +152,6 @@ class SharedFoveae:
         return place
 
     async def _serve(self, request: web.Request) -> web.Response:
-        require(request, "view")
         if request.match_info["epoch"] != self._epoch:
             raise web.HTTPGone(text="the library has changed since: ask for the place again")
         scan, view = await self._exhibits.open(request.match_info["scan"], "htj2k")
@@ -217,21 +216,10 @@ def _numbers(text: str, count: int) -> tuple[list[int], list[int], tuple[int, ..
     return numbers[:LATTICE_NUMBERS], numbers[LATTICE_NUMBERS:count], tuple(numbers[count:]) or None
 
 
-def _asked(request: web.Request) -> tuple[m.Look, m.CodecName]:
-    """The look a query stands for. Raises 400 naming what is wrong with it."""
-    query = dict(request.query)
-    if unknown := query.keys() - QUERY_KEYS:
-        raise web.HTTPBadRequest(text=f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(sorted(QUERY_KEYS))}")
-    codec = query.pop("codec", "htj2k")
-    if codec not in CODECS:
-        raise web.HTTPBadRequest(text=f"codec must be one of {', '.join(CODECS)}")
-    camel = {"texture_db": "textureDb", "range_mm": "rangeMm", "max_bytes": "maxBytes"}
-    fields = {camel.get(key, key): value for key, value in query.items()}
-    try:
-        look = msgspec.convert({"type": "look", "request": 0, **fields}, m.Look, strict=False)
-    except msgspec.ValidationError as error:
-        raise web.HTTPBadRequest(text=f"fovea: {error}") from None
-    return look, codec  # type: ignore[return-value]
+def _look(query: FoveaQuery) -> m.Look:
+    """What the query stands for."""
+    fields = {name: value for name, value in structs.asdict(query).items() if value is not UNSET and name != "codec"}
+    return m.Look(request=0, **fields)
 
 
 async def _ready(body: bytes) -> bytes:

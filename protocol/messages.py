@@ -24,6 +24,8 @@ Unit = Annotated[float, Meta(ge=0, lt=1)]
 Share = Annotated[float, Meta(gt=0, le=1)]
 Alpha = Annotated[float, Meta(ge=0.005, le=4)]
 Scale = Annotated[float, Meta(ge=0.01, le=10000)]
+Decibel = Annotated[float, Meta(ge=10, le=100)]
+RangeError = Annotated[float, Meta(ge=0, le=1000)]  # [mm]
 Seconds = Annotated[float, Meta(ge=0.05, le=30)]
 ByteCount = Annotated[int, Meta(ge=0, le=1 << 40)]
 Count = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
@@ -346,8 +348,8 @@ class Look(_Message, frozen=True):
     u: Unit
     v: Unit
     window: Share = 0.05
-    texture_db: Annotated[float, Meta(ge=10, le=100)] = 40.0
-    range_mm: Annotated[float, Meta(ge=0, le=1000)] = 0.1
+    texture_db: Decibel = 40.0
+    range_mm: RangeError = 0.1
     max_wait_s: Seconds | None = None
     max_bytes: ByteCount | None = None
     fill: bool = False

@@ -27,7 +27,9 @@ Role = Literal["monitor", "view", "operate", "admin"]
 """What a token lets its owner do; each includes the one before. monitor : see how the node is, and no scan."""
 Hex128 = Annotated[str, Meta(pattern="^[0-9a-f]{32}$")]
 Hex256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
-Name = Annotated[str, Meta(min_length=1, max_length=60, pattern="^[^\\x00-\\x1f\\x7f-\\x9f]+$")]
+Name = Annotated[  # "$" instead of the last group would let a newline at the end in
+    str, Meta(min_length=1, max_length=60, pattern="^[^\\x00-\\x1f\\x7f-\\x9f]+(?![\\s\\S])")
+]
 
 
 class PairRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -27,12 +27,14 @@ from client.shared import refinements_in
 from client.trust import certificate_pin
 from drivers.address import check_address
 from exchange.image import encode_png, read_image
-from node import auth, derive, library_routes, pairing, proxy, shared
+from node import auth, library_routes, proxy, shared
 from node.attempts import place_of_address
 from node.audit import NODE, begins_a_time, entry, read_trail
+from node.bodies import Derivation, FoveaQuery, NewCode
 from node.identity import node_identity
 from node.library import About, Library, survey
 from node.library_folder import MARK_FILE, check_format
+from node.rest import decoded, query_of
 from node.scan_folder import read_grid
 from node.sidecar import Changes, read_sidecar
 from node.tls import _read_key, read_certificate, renew_own
@@ -87,7 +89,7 @@ def of_hearsay() -> Iterable[Target]:
     blocks = planner.shapes[Channel.RANGE].blocks
     yield Target("envelope", (_deflated(bytes(2 * blocks[0] * blocks[1])),), _EnvelopeOf(planner))
     derivation = msgspec.json.encode({"geometry": "sphere", "caps": True, "top": "latest", "tipDeg": 80})
-    yield Target("derivation", (derivation,), derive._decoded, REFUSED)
+    yield Target("derivation", (derivation,), lambda data: decoded(data, Derivation), REFUSED)
     yield Target("code", (b'{"name":"x","role":"view"}',), _decode_code, REFUSED)
     yield Target("if-match", (b'"3"',), _asked({"If-Match": ""}, library_routes._revision), REFUSED)
     yield Target("bearer", (b"Bearer abc",), _asked({"Authorization": ""}, auth._token_shown), REFUSED)
@@ -176,7 +178,7 @@ class _EnvelopeOf:
 
 
 def _decode_code(data: bytes) -> object:
-    return pairing._decoded(data, pairing.NewCode)
+    return decoded(data, NewCode)
 
 
 def _asked(headers: dict[str, str], read: Callable[[web.Request], object]) -> Callable[[bytes], object]:
@@ -194,4 +196,4 @@ def _number_fovea(data: bytes) -> object:
 
 
 def _query(data: bytes) -> object:
-    return shared._asked(make_mocked_request("GET", f"/?{urllib.parse.quote(data, safe='=&%+.')}"))
+    return shared._look(query_of(make_mocked_request("GET", f"/?{urllib.parse.quote(data, safe='=&%+.')}"), FoveaQuery))

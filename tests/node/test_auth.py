@@ -15,6 +15,7 @@ from client import NodeLost, RequestRefused, connect
 from node.access import Access
 from node.auth import COOKIE, NOBODY, SUBPROTOCOL, WRONG_TOKENS, Auth
 from node.config import Config, Server
+from node.endpoints import ENDPOINTS, roles_table
 from node.serve import NodeServer
 from protocol.messages import PROTOCOL
 from protocol.pairing import Role
@@ -30,28 +31,18 @@ async def node(tmp_path: Path) -> AsyncIterator[Entrance]:
         yield node
 
 
-def table() -> dict[tuple[str, str], Role | None]:
-    """Request -> the least role that may make it, as README says."""
-    [text] = re.findall(r"^\| role \| may .*?\n\n", README, re.DOTALL | re.MULTILINE)
-    found: dict[tuple[str, str], Role | None] = {}
-    for role, requests in re.findall(r"^\| (nobody|monitor|view|operate|admin) \| (.*) \|$", text, re.MULTILINE):
-        for method, path in re.findall(r"`([A-Z]+) (\S+)`", requests):
-            found[method, path] = None if role == "nobody" else role
-    return found
-
-
 def routes(node: Entrance) -> list[tuple[str, str]]:
     every = (route for route in node.server._app.router.routes() if route.method != "HEAD" and route.resource)
     return sorted({(route.method, route.resource.canonical) for route in every if route.resource})
 
 
-async def test_the_table_of_the_readme_names_every_request(node: Entrance) -> None:
-    assert sorted((method, path.replace("{id}", "{scan}")) for method, path in table()) == routes(node)
+async def test_the_table_of_endpoints_is_what_the_node_answers_and_the_readme_says(node: Entrance) -> None:
+    assert sorted((one.method, one.canonical) for one in ENDPOINTS.values()) == routes(node)
+    assert roles_table() in README, roles_table()
 
 
 async def test_each_role_may_ask_exactly_what_the_table_says(node: Entrance) -> None:
     tokens = {role: node.token(role) if role else "" for role in ROLES}
-    least = {(method, path.replace("{id}", "{scan}")): role for (method, path), role in table().items()}
     for method, path in routes(node):
         scan = node.scan if method == "GET" else "0" * 32
         place = path.replace("{scan}", scan).replace("{format}", "stl")
@@ -60,7 +51,7 @@ async def test_each_role_may_ask_exactly_what_the_table_says(node: Entrance) -> 
             async with node.ask(method, place, tokens[role]) as answer:
                 status = answer.status
                 said = await answer.read()
-            may = ROLES.index(role) >= ROLES.index(least[method, path])
+            may = ROLES.index(role) >= ROLES.index(ENDPOINTS[f"{method} {path}"].role)
             if role is None and path == "/":
                 assert (status, answer.headers["Location"]) == (303, "/pair")
             elif may:

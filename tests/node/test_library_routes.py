@@ -10,7 +10,7 @@ from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
 from node import durable
-from node.auth import LOGIN, Login, Role
+from node.auth import LOGIN, Login
 from node.capture import CaptureStatus
 from node.library import About, Library
 from node.library_routes import LibraryRoutes
@@ -23,9 +23,8 @@ Client = TestClient[web.Request, web.Application]
 
 
 class Bench:
-    """A library with one scan and one interrupted sweep behind the routes; whoever asks has `role`."""
+    """A library with one scan and one interrupted sweep behind the routes."""
 
-    role: Role = "admin"
     is_busy = False
 
     def __init__(self, folder: Path) -> None:
@@ -53,7 +52,7 @@ class Bench:
 
     @web.middleware
     async def admit(self, request: web.Request, handler: Any) -> web.StreamResponse:
-        request[LOGIN] = Login("somebody", self.role)
+        request[LOGIN] = Login("somebody", "operate")
         response: web.StreamResponse = await handler(request)
         return response
 
@@ -192,24 +191,6 @@ async def test_a_full_disk_is_told_as_such(bench: Bench, client: Client, monkeyp
     monkeypatch.setattr(durable.os, "replace", full_disk)  # type: ignore[attr-defined]
     answer = await client.patch(f"/v1/scans/{bench.scan}/sidecar", json={"notes": "a"})
     assert (answer.status, "No space left" in await answer.text()) == (507, True)
-
-
-@pytest.mark.parametrize(
-    ("method", "path", "role"),
-    [
-        ("PATCH", "/v1/scans/{scan}/sidecar", "view"),
-        ("POST", "/v1/scans/{scan}/verify", "view"),
-        ("DELETE", "/v1/scans/{scan}", "view"),
-        ("POST", "/v1/sweeps/{sweep}/resume", "view"),
-        ("DELETE", "/v1/sweeps/{sweep}", "view"),
-    ],
-)
-async def test_who_may_not_is_refused(bench: Bench, client: Client, method: str, path: str, role: Role) -> None:
-    bench.role = role
-    answer = await client.request(method, path.format(scan=bench.scan, sweep=bench.sweep), data=b'{"name": "x"}')
-    assert answer.status == 403
-    assert len(bench.library.scans()) == len(bench.library.sweeps.interrupted()) == 1
-    assert bench.library.sidecar(bench.scan).revision == 0 and bench.resumed == []
 
 
 async def test_without_a_scanner_nothing_can_be_resumed(bench: Bench) -> None:
