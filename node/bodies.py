@@ -191,9 +191,9 @@ class ListedSweep(_Body, frozen=True):
 
 
 class PairingForm(Struct, frozen=True):
-    """What the page for pairing sends."""
+    """What the page for pairing sends, with hyphens and blanks or without."""
 
-    code: str
+    code: Annotated[str, Meta(pattern="^[- ]*([A-Za-z2-7][- ]*){16}$")]
 
 
 class NewCode(_Asked, frozen=True):

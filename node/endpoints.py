@@ -6,6 +6,7 @@ events, `node.openapi` describes it to programs, and README's table of roles is 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
@@ -41,7 +42,8 @@ class Endpoint:
     """A request, and what may come of it.
 
     path : as routes have it, patterns and all.  does : in a few words.  role : the least that may; None: anybody.
-    query : a record.  headers : more than every request may have.  takes : the body.
+    named : what may stand in the path, where that is less than PARAMETERS says.  query : a record.  headers : more
+    than every request may have.  takes : the body.
     gives : the answers; None: one without a body.  fails : beside what `statuses` says of all.
     event : what the audit log calls it when it was answered well; None: nothing, or its handler says more.
     """
@@ -49,6 +51,7 @@ class Endpoint:
     method: str
     path: str
     does: str
+    named: Mapping[str, Any] = field(default_factory=dict)
     query: Any = None
     headers: Mapping[str, Any] = field(default_factory=dict)
     takes: Content | None = None
@@ -56,6 +59,11 @@ class Endpoint:
     fails: tuple[int, ...] = ()
     event: Event | None = None
     role: pairing.Role | None = None
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """What stands in the path, by its name there."""
+        return {name: self.named.get(name, PARAMETERS[name]) for name in re.findall(r"\{(\w+)\}", self.canonical)}
 
     @property
     def canonical(self) -> str:
@@ -70,6 +78,7 @@ def _json(kind: Any) -> Content:
 BINARY: Content = {"application/octet-stream": bytes}
 HTML: Content = {"text/html": bytes}
 OR_HTML: Content = {**_json(b.Error), **HTML}
+WHOLE = {"scan": b.ScanId}  # what is changed is named by its whole id
 
 MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
     (None, "pair; hear one word of the node's health", (
@@ -81,7 +90,8 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         ),
         Endpoint("GET", "/assets/{name}", "a part of the page", gives={200: {"*/*": bytes}, 304: None}),
         Endpoint(
-            "GET", "/healthz", "how the node is", gives={200: _json(b.HealthSaid), 503: _json(b.HealthSaid | b.Error)},
+            "GET", "/healthz", "how the node is",
+            gives={200: _json(b.HealthSaid), 503: _json(Any)},  # stopping, or too much is asked
         ),
     )),
     ("monitor", "read the numbers, and why health is as it is", (
@@ -129,7 +139,7 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         Endpoint("GET", "/v1/node", "who the node is and what it does", gives={200: _json(b.NodeStatus)}),
         Endpoint("GET", "/v1/sweeps", "interrupted sweeps", gives={200: _json(tuple[b.ListedSweep, ...])}),
         Endpoint(
-            "GET", "/v1/sweeps/{sweep:[0-9a-f]+}.npz", "what there is of one", gives={200: BINARY}, fails=(507,),
+            "GET", "/v1/sweeps/{sweep:[^./]+}.npz", "what there is of one", gives={200: BINARY}, fails=(507,),
             event="sweep exported",
         ),
     )),
@@ -153,14 +163,16 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
     )),
     ("operate", "rename, pin, annotate, verify, delete a scan", (
         Endpoint(
-            "PATCH", "/v1/scans/{scan}/sidecar", "say something of a scan",
+            "PATCH", "/v1/scans/{scan}/sidecar", "say something of a scan", named=WHOLE,
             headers={"If-Match": Annotated[str, Meta(pattern='^([*]|"[0-9]{1,9}")$')]},
             takes=_json(Changes), gives={200: _json(Sidecar)}, fails=(412, 507), event="changed",
         ),
         Endpoint(
             "POST", "/v1/scans/{scan}/verify", "read every sample", gives={200: _json(b.Verified)}, event="verified"
         ),
-        Endpoint("DELETE", "/v1/scans/{scan}", "delete a scan", gives={204: None}, fails=(400,), event="deleted"),
+        Endpoint(
+            "DELETE", "/v1/scans/{scan}", "delete a scan", named=WHOLE, gives={204: None}, fails=(400,), event="deleted"
+        ),
     )),
     ("admin", "let in and put out; read who did what", (
         Endpoint(

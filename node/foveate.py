@@ -206,7 +206,7 @@ class _Planner:
         if range_bytes > self._left:
             return math.inf
         mse, target_mse = self._texture.expected_mse(self._left - range_bytes), mse_of_db(self._look.texture_db)
-        return float(doubled + max(math.log2(mse / target_mse) / 2, 0))
+        return float(doubled + math.log2(max(mse / target_mse, 1)) / 2)
 
     def _fill_range(self, wanted: RangeParameters, limit_bytes: float) -> list[Coded]:
         """Range as wanted; where bytes are short, the best that they allow."""

@@ -22,6 +22,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from http import HTTPStatus
 from typing import Any
 
 from aiohttp import ClientError, web
@@ -32,6 +33,7 @@ from node.auth import STREAM
 from node.bucket import Buckets, whole_seconds
 from node.config import Limits
 from node.endpoints import place_of
+from node.rest import harden, refusal
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +67,18 @@ class Line(web.RequestHandler):
     def connection_lost(self, exc: BaseException | None) -> None:  # noqa: D102  # as asyncio has it
         super().connection_lost(exc)
         self._gate.leave(self)
+
+    def handle_error(
+        self, request: web.BaseRequest, status: int = 500, exc: BaseException | None = None, message: str | None = None
+    ) -> web.StreamResponse:
+        """What is no HTTP, in the words and with the headers of every other error. Closes the connection."""
+        log.warning("what came from %s is no request: %s", request.remote, type(exc).__name__)
+        if request.writer.output_size > 0:
+            raise ConnectionError("half an answer is on its way")
+        answer = refusal(status, "that is no HTTP" if status == 400 else HTTPStatus(status).phrase)
+        harden(answer)
+        answer.force_close()
+        return answer
 
 
 class Gate:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from http import HTTPStatus
@@ -12,7 +11,7 @@ from typing import Any
 import msgspec
 
 from node.auth import COOKIE
-from node.endpoints import ENDPOINTS, PARAMETERS, Content, Endpoint, statuses
+from node.endpoints import ENDPOINTS, Content, Endpoint, statuses
 
 OPENAPI = "3.1.0"
 REF = "#/components/schemas/{name}"
@@ -64,8 +63,8 @@ def _operation(endpoint: Endpoint, schemas: Mapping[Any, Schema], components: Ma
 def _parameters(
     endpoint: Endpoint, schemas: Mapping[Any, Schema], components: Mapping[str, Schema]
 ) -> Iterable[Schema]:
-    for name in re.findall(r"\{(\w+)\}", endpoint.canonical):
-        yield {"name": name, "in": "path", "required": True, "schema": schemas[PARAMETERS[name]]}
+    for name, kind in endpoint.parameters.items():
+        yield {"name": name, "in": "path", "required": True, "schema": schemas[kind]}
     if endpoint.query:
         query = components[endpoint.query.__name__]
         for name, schema in query["properties"].items():
@@ -80,8 +79,7 @@ def _content(content: Content | None, schemas: Mapping[Any, Schema]) -> Schema:
 
 def _kinds(endpoint: Endpoint) -> Iterable[Any]:
     """Every record of an endpoint."""
-    yield from (PARAMETERS[name] for name in re.findall(r"\{(\w+)\}", endpoint.canonical))
-    yield from filter(None, (endpoint.query, *endpoint.headers.values()))
+    yield from filter(None, (*endpoint.parameters.values(), endpoint.query, *endpoint.headers.values()))
     for content in filter(None, (endpoint.takes, *statuses(endpoint).values())):
         yield from content.values()
 

@@ -37,7 +37,7 @@ from node.openapi import described
 from node.page import Page
 from node.pairing import PairingRoutes
 from node.proxy import believe
-from node.rest import query_of, refusal, said
+from node.rest import harden, query_of, refusal, said
 from node.retention import delete, expired_in
 from node.shared import SharedFoveae
 from node.tls import Tls
@@ -59,13 +59,6 @@ RENEW_S = 3600.0  # between looks at the certificate
 REQUESTS_S = 1.0  # that requests in work get to end when the node stops
 ANSWERED = web.RequestKey("answered", bool)  # the head of the answer is made
 KEPT_HEADERS = ("Allow", "Retry-After")  # of an error that is put in our words
-SECURITY_HEADERS = {
-    "Cache-Control": "no-store",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
-    "Cross-Origin-Resource-Policy": "same-origin",
-}
 
 
 class NodeServer:
@@ -360,9 +353,7 @@ def _bound_buffers(transport: asyncio.Transport) -> None:
 
 async def _harden(request: web.Request, response: web.StreamResponse) -> None:
     request[ANSWERED] = True
-    for name, value in SECURITY_HEADERS.items():
-        response.headers.setdefault(name, value)
-    response.headers["Server"] = "foveascan"  # instead of which Python and which library, to whoever asks
+    harden(response)
 
 
 @web.middleware

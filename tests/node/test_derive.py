@@ -15,13 +15,19 @@ import pytest
 from exchange.closing import close_scan, closes
 from exchange.native import NOTE_MAX, read_native
 from node import derive
+from node.bodies import Derivation
 from node.durable import NoRoom
+from node.first_view import build_first_view, texture_as_seen
+from node.foveate import plan_update
 from node.library import About, Library, content_id
 from node.serve import NodeServer
+from node.texture_model import TextureModel
 from protocol.grid import Grid
+from protocol.messages import Look
 from simulators.nutcracker import nutcracker
 from simulators.pebble import pebble
 from simulators.shapes import cylinder, sphere
+from tests.exchange.grids import vase
 from tests.exchange.tipped import lying, swept
 from tests.node.served import Client, served
 
@@ -95,6 +101,15 @@ async def test_a_sphere_becomes_a_cylinder_on_demand(tmp_path: Path) -> None:
         assert back["geometry"] == "cylinder"
         assert library.open(back["id"]).about.made_from == (closed["id"],)
         assert "axis" in back["note"] and closed["note"] in back["note"]
+
+
+def test_where_no_error_is_left_a_byte_limit_is_no_reason_to_fail(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    ball = derive.derive(library, library.add(vase(), About(1e9)).id, Derivation("sphere"), lambda share: None)
+    view = build_first_view(ball, "htj2k", 32768)
+    model = TextureModel(ball.texture, texture_as_seen(view))
+    look = Look(1, 0, 0, scale=5e-324, texture_db=10, range_mm=0)
+    assert plan_update(ball, view.state, look, "htj2k", 1 << 40, model=model).reason == "complete"
 
 
 @pytest.mark.parametrize(

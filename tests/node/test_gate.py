@@ -242,3 +242,12 @@ async def test_who_does_not_read_the_answer_is_cut_off(tmp_path: Path) -> None:
         await until(lambda: not node.server._gate.connections)
         async with node.ask("GET", "/healthz") as answer:
             assert answer.status == 200
+
+
+async def test_what_is_no_http_is_told_so_and_nothing_of_us(tmp_path: Path) -> None:
+    async with entrance(tmp_path / "library") as node, line_to(node) as (reader, writer):
+        writer.write(b"GET /v1/scans HTTP/1.1\r\nHost: x\r\nA\x00B: y\r\n\r\n")
+        said = (await reader.read()).decode()
+    assert said.partition(" ")[2].startswith("400 ")
+    assert said.endswith('{"code":"bad request","message":"that is no HTTP"}')
+    assert "Server: foveascan\r\n" in said and "Content-Type: application/json" in said

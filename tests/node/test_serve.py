@@ -192,7 +192,7 @@ async def test_health_says_when_the_audit_log_cannot_be_written(tmp_path: Path, 
         await ask(node, "/v1/scans")
         await until(lambda: server.audit.trouble)
         _, said = await ask(node, "/healthz")
-    assert said["reasons"] == ["the audit log cannot be written: Not a directory"]
+    assert said["reasons"] == ["the audit log cannot be written: File exists"]
 
 
 @pytest.mark.parametrize(
