@@ -62,8 +62,10 @@ def run_serve(args: argparse.Namespace) -> int:
     from node.config import load_config
     from node.daemon import run_node
     from node.log import set_log, start_log
+    from node.memory import bound_arenas
 
     start_log()
+    bound_arenas()
     faulthandler.enable()  # a watchdog ends us with SIGABRT: then the journal says where every thread was
     overrides = {
         "library.folder": args.library,

@@ -28,6 +28,7 @@ from node.identity import node_identity
 from node.library import About, Library, Scan
 from node.live import Live
 from node.log import set_log
+from node.memory import settle
 from node.notify import Beating, Notifier, keep_notified, status_text
 from node.reload import Change, compare
 from node.resume import publish_complete
@@ -84,6 +85,7 @@ async def run_node(config: Config, ready: Callable[[str], None], reread: Callabl
     notifier = Notifier.from_environment(os.environ)
     async with AsyncExitStack() as stack:
         node = await start_node(config, stack)
+        settle()
         ready(node.url)
         notifier.ready(status_text(node.url, node.capture))
         telling = asyncio.create_task(keep_notified(notifier, node.url, node.capture, node.parts()))

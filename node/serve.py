@@ -327,6 +327,7 @@ class NodeServer:
             await connection.run()
         finally:
             del self._connections[connection]
+            stream._cancel_heartbeat()  # aiohttp begins it anew for what comes while it closes, and keeps all for it
         return stream
 
     def _capture_status(self) -> CaptureStatus:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
+import weakref
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +18,7 @@ from aiohttp import ClientWebSocketResponse, WSMsgType
 from node import connection
 from node.bound import Bound
 from node.library import About, Library
+from node.serve import HEARTBEAT_S
 from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.holdings import Holdings
@@ -140,3 +143,16 @@ async def test_the_reason_of_a_close_is_whole_characters(node: Client, letter: s
     end = await stream.receive()
     assert (end.type, end.data) == (WSMsgType.CLOSE, 1002)
     assert str(end.extra).startswith(f"bad message: Invalid value '{letter}")
+
+
+async def test_nothing_is_kept_of_a_stream_that_has_ended(tmp_path: Path) -> None:
+    async with served(Library(tmp_path)) as (client, server):
+        stream = await client.ws_connect("/v1/stream", protocols=[m.PROTOCOL])
+        await stream.receive()
+        [ours] = [weakref.ref(one._socket) for one in server._connections]
+        await stream.send_str("nothing that a client says")
+        assert (await stream.receive()).type is WSMsgType.CLOSE
+        async with asyncio.timeout(HEARTBEAT_S / 2):  # after as long it would be let go of anyway
+            while ours() is not None:
+                await asyncio.sleep(0.01)
+                gc.collect()
