@@ -139,7 +139,7 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         Endpoint("GET", "/v1/node", "who the node is and what it does", gives={200: _json(b.NodeStatus)}),
         Endpoint("GET", "/v1/sweeps", "interrupted sweeps", gives={200: _json(tuple[b.ListedSweep, ...])}),
         Endpoint(
-            "GET", "/v1/sweeps/{sweep:[^./]+}.npz", "what there is of one", gives={200: BINARY}, fails=(507,),
+            "GET", "/v1/sweeps/{sweep}.npz", "what there is of one", gives={200: BINARY}, fails=(507,),
             event="sweep exported",
         ),
     )),
@@ -165,7 +165,8 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         Endpoint(
             "PATCH", "/v1/scans/{scan}/sidecar", "say something of a scan", named=WHOLE,
             headers={"If-Match": Annotated[str, Meta(pattern='^([*]|"[0-9]{1,9}")$')]},
-            takes=_json(Changes), gives={200: _json(Sidecar)}, fails=(412, 507), event="changed",
+            takes=_json(Annotated[Changes, Meta(extra_json_schema={"minProperties": 1})]),
+            gives={200: _json(Sidecar)}, fails=(412, 507), event="changed",
         ),
         Endpoint(
             "POST", "/v1/scans/{scan}/verify", "read every sample", gives={200: _json(b.Verified)}, event="verified"

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import ConfigError
+from tests.fuzz.described import attack_described
 from tests.fuzz.parsers import targets
 from tests.fuzz.ports import PORTS, attack
 from tests.fuzz.target import fuzz
 
 ROOT = Path(__file__).parents[2]
 GROWN_MB_MAX = 20.0
+DESCRIBED = "openapi"
 TAIL = 2000
 START_S, EACH_S = 600.0, 0.05  # what a target, and a message to it, may take on a machine with other work
 
@@ -25,7 +27,7 @@ START_S, EACH_S = 600.0, 0.05  # what a target, and a message to it, may take on
 def run(names: Sequence[str], count: int, first: int) -> dict[str, Any]:
     """What each target did. names : of targets, none: all.  first : seed. Raises ConfigError for an unknown name."""
     with tempfile.TemporaryDirectory() as folder:
-        known = [*(target.name for target in targets(Path(folder))), *PORTS]
+        known = [*(target.name for target in targets(Path(folder))), *PORTS, DESCRIBED]
     for name in names:
         if name not in known:
             raise ConfigError(f"bench: no target {name!r}; there are {', '.join(known)}")
@@ -58,6 +60,9 @@ def one(name: str, count: int, first: int) -> dict[str, Any]:
         record = attack(name, count, first)
         is_ok = not record["failures"] and record["served"] > 0 and record["grown_mb"] <= GROWN_MB_MAX
         return {"ok": is_ok, "found": record["failures"], **record}
+    if name == DESCRIBED:
+        record = attack_described(count, first)
+        return {"ok": not record["failures"], "found": record["failures"], "asked": record["requests"]}
     with tempfile.TemporaryDirectory() as folder:
         [target] = [target for target in targets(Path(folder)) if target.name == name]
         fuzz(target, count, first)
@@ -76,6 +81,8 @@ def _line(row: dict[str, Any]) -> str:
     port = ""
     if "grown_mb" in row:
         port = f", {row['messages']} messages, others served {row['served']} times, memory {row['grown_mb']:+.1f} MB"
+    if "asked" in row:
+        port = f", {row['asked']} requests"
     found = "" if row["ok"] else f"\n{'':7}{row['found']}"
     return f"{'ok' if row['ok'] else 'FOUND':6} {row['target']:20} {row['seconds']:.0f} s{port}{found}"
 
