@@ -63,7 +63,12 @@ async def check_granted(response: aiohttp.ClientResponse) -> None:
 
 
 def reply(status: int, body: bytes) -> Any:
-    """The JSON of an answer. Raises RequestRefused for a refusal, RemoteWireError for anything that is no JSON."""
+    """The JSON of an answer, None where it has none (204).
+
+    Raises RequestRefused for a refusal, RemoteWireError for anything that is no JSON.
+    """
+    if status == 204:
+        return None
     try:
         said = msgspec.json.decode(body)
     except (msgspec.DecodeError, UnicodeError, RecursionError) as problem:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from client.session import Session
-    from protocol.messages import ScanQuality
+    from protocol.quality import ScanQuality
 
 POLL_S = 0.2
 AWAY_S = 35.0  # a node goes on by itself with a sweep that was cut for half a minute ...
@@ -48,6 +48,8 @@ def _in_words(quality: ScanQuality) -> Iterator[str]:
     """What a person should know of a scan, a line each."""
     noise = "" if quality.noise_mm is None else f", noise {quality.noise_mm:.3g} mm"
     yield f"coverage {100 * quality.coverage:.1f} %{noise}, {quality.holes} void cells in holes"
+    if quality.axis is not None:
+        yield f"corrected for an axis {quality.axis.in_words} off"
     yield from (printable(complaint) for complaint in quality.complaints)
 
 
@@ -55,11 +57,11 @@ async def _scan(args: argparse.Namespace) -> tuple[str, ScanQuality | None]:
     from client.session import connect
 
     async with connect(await chosen_node(args), token=args.token) as session:
-        scan = await _sweep(session, silent=args.json)
+        scan = await sweep_once(session, silent=args.json)
         return scan, await session.quality(scan)
 
 
-async def _sweep(session: Session, *, silent: bool) -> str:
+async def sweep_once(session: Session, *, silent: bool) -> str:
     """Start a sweep when the scanner is ready, follow it, return the scan's id. Raises ScannerFault when it fails."""
     import asyncio
     import time

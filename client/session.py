@@ -33,6 +33,7 @@ from protocol.errors import CodecError, LatticeError, LocalWireError, RemoteWire
 from protocol.holdings import LevelArray, RankArray
 from protocol.inflate import inflate
 from protocol.lattice import Channel
+from protocol.quality import ScanQuality
 from protocol.sphere import click_of
 
 
@@ -66,7 +67,7 @@ async def connect(
 class _Assessed(msgspec.Struct):
     """What is read of GET /v1/scans/{id}; a node of an earlier version says no quality."""
 
-    quality: m.ScanQuality | None = None
+    quality: ScanQuality | None = None
 
 
 class _Scanner(msgspec.Struct):
@@ -249,7 +250,7 @@ class Session:
         said = await ask(self._http, "GET", f"{self._stream.url}/v1/scans")
         return checked(said, list[dict[str, Any]], f"{self._stream.url} lists its scans")
 
-    async def quality(self, scan: str) -> m.ScanQuality | None:
+    async def quality(self, scan: str) -> ScanQuality | None:
         """What a scan is worth; None of one that came as a file. scan : an id or "latest"."""
         said = await ask(self._http, "GET", f"{self._stream.url}/v1/scans/{scan}")
         return checked(said, _Assessed, f"{self._stream.url} describes the quality of scan {scan}").quality

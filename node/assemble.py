@@ -18,6 +18,8 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
+from node.axis import Axis
+from node.axis_correction import corrected
 from node.laps import OUTLIER_SIGMAS, average, difference_sigma, shift_between
 from node.repair import Repaired, repair
 from node.resampling import (
@@ -65,10 +67,15 @@ class IncompleteTurn(FoveascanError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assembly:
-    """A finished sweep: its grid, which tells what was repaired of it, and what it is worth."""
+    """A finished sweep: its grid, which tells what was repaired of it, and what it is worth.
+
+    scanner, settings : who swept it, by serial number, and the number of its calibration then, where that is known.
+    """
 
     grid: Grid
     quality: ScanQuality
+    scanner: str = ""
+    settings: int = 0
 
 
 class Assembler:
@@ -123,14 +130,18 @@ class Assembler:
         """The sweep as a grid of equal angles, averaged where it was seen more than once. Raises IncompleteTurn."""
         return self._average()[0]
 
-    def assembly(self, *, repairs: bool = True, apart: bool = False) -> Assembly:
+    def assembly(self, *, repairs: bool = True, apart: bool = False, axis: Axis | None = None) -> Assembly:
         """The grid, and what there is to say about it. Raises IncompleteTurn.
 
         repairs : take spikes out and fill small holes; without, every sample is one that was measured.
         apart : range and texture were not seen at the same time.
+        axis : the table's own, where it is not the one that the sensor believes in; the grid is laid about it.
         """
         grid, quality = self._average(apart)
-        repaired = repair(grid, quality.noise_mm or 0.0) if repairs else Repaired(grid, 0, 0)
+        if repairs:
+            repaired = repair(grid, quality.noise_mm or 0.0, axis)
+        else:
+            repaired = Repaired(corrected(grid, axis) if axis else grid, 0, 0)
         found = survey(repaired.grid)
         said = replace(
             quality,
@@ -140,6 +151,7 @@ class Assembler:
             holes=found.holes,
             dead_rows=found.dead_rows,
             saturated_columns=found.saturated_columns,
+            axis=axis,
         )
         return Assembly(repaired.grid, said)
 

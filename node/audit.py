@@ -44,7 +44,8 @@ BEGINS_A_TIME = "^" + "".join(f"([{'0-9' if char == '0' else char}]" for char in
 Event = Literal[
     "started", "stopped", "listed", "watched", "opened", "seen", "read", "exported", "imported", "scanned", "derived",
     "changed", "verified", "deleted", "sweep asked", "sweep resumed", "sweep exported", "sweep deleted", "expired",
-    "backed up", "restored", "code offered", "paired", "revoked", "codes voided", "refused",
+    "axis calibrated", "axis forgotten", "backed up", "restored", "code offered", "paired", "revoked", "codes voided",
+    "refused",
 ]  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 OFFSET_MAX_MM = 1000.0
 LEAN_MAX_RAD = 0.1
 
-Array = TypeVar("Array", NDArray[np.float64], NDArray[np.float32])
+Lengths = NDArray[np.floating]  # double or single precision, as it comes
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +56,7 @@ class Axis:
         return bool(self.lean_rad or self.side_rad)
 
 
-def seen_to_true(axis: Axis, range_mm: Array, height_mm: Array) -> tuple[Array, Array, Array]:
+def seen_to_true(axis: Axis, range_mm: Lengths, height_mm: Lengths) -> tuple[Lengths, Lengths, Lengths]:
     """Where samples are: Eq. (1) and (2). range_mm, height_mm : any shapes that go together.
 
     Returns their distance from the axis [mm], by how much they are ahead of their column [rad], and their height [mm].
@@ -71,7 +70,7 @@ def seen_to_true(axis: Axis, range_mm: Array, height_mm: Array) -> tuple[Array, 
     return np.hypot(p_x, p_y), np.arctan2(p_y, p_x), level * cos_side + (axis.height_mm - axis.lateral_mm * sin_side)
 
 
-def true_to_seen(axis: Axis, radius_mm: Array, height_mm: Array) -> tuple[Array, Array, Array]:
+def true_to_seen(axis: Axis, radius_mm: Lengths, height_mm: Lengths) -> tuple[Lengths, Lengths, Lengths]:
     """Inverse of seen_to_true: the range a point is seen at, by how much it is ahead of that column, the row's height.
 
     NaN where the line of sight passes the axis further away than the point.
@@ -86,7 +85,7 @@ def true_to_seen(axis: Axis, radius_mm: Array, height_mm: Array) -> tuple[Array,
     return x - axis.radial_mm, np.arctan2(p_y, p_x), p_x * sin_lean + level * cos_lean + axis.height_mm
 
 
-def true_height(axis: Axis, radius_mm: Array, row_height_mm: Array) -> Array:
+def true_height(axis: Axis, radius_mm: Lengths, row_height_mm: Lengths) -> Lengths:
     """The height of samples of which the distance from the axis is known, and the row that saw them. [mm]"""
     cos_lean, sin_lean, cos_side, sin_side = _turns(axis)
     h = row_height_mm - axis.height_mm

@@ -16,16 +16,21 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from node.axis import Axis, seen_to_true, true_height, true_to_seen
-from protocol.grid import STEPS_MAX, VOID, FloatArray, GridSpec, ImageArray, IntArray, StepArray
+from node.axis import Axis, Lengths, seen_to_true, true_height, true_to_seen
+from protocol.grid import STEPS_MAX, VOID, Grid, GridSpec, ImageArray, IntArray, StepArray
 
 GAP = 2.0  # neighbours that come to lie further apart, in places of the grid, are none any longer
 _BAND = 64
 _BEYOND_RAD = math.pi / 2
 
-Places = NDArray[np.float32]
+
+
+def corrected(grid: Grid, axis: Axis) -> Grid:
+    """A grid without repairs about the true axis. Its texture is moved in place."""
+    steps = corrected_range(grid.range_steps, grid.spec, axis)
+    correct_texture(grid.texture, steps, grid.spec, axis)
+    return Grid(grid.spec, steps, grid.texture)
 
 
 def corrected_range(steps: StepArray, spec: GridSpec, axis: Axis) -> StepArray:
@@ -52,7 +57,7 @@ def corrected_range(steps: StepArray, spec: GridSpec, axis: Axis) -> StepArray:
     return corrected
 
 
-def laid_out(values: Places, at: Places, *, is_cyclic: bool) -> StepArray:
+def laid_out(values: Lengths, at: Lengths, *, is_cyclic: bool) -> StepArray:
     """Samples that stand somewhere, at whole places: (n, L) uint16, linear between neighbours, 0 where there are none.
 
     values : (n, L) float32 steps, 0 = void.  at : (n, L) float32, the place of each, in samples.  is_cyclic : the last
@@ -80,7 +85,7 @@ def laid_out(values: Places, at: Places, *, is_cyclic: bool) -> StepArray:
     return out.reshape(n, length)
 
 
-def _index(samples: IntArray, place: Places, length: int, is_cyclic: bool) -> IntArray:
+def _index(samples: IntArray, place: Lengths, length: int, is_cyclic: bool) -> IntArray:
     """Where places lie in the flat output, each in its sample's row; -1 for none."""
     columns = place.astype(np.int64)
     begin = samples - samples % length
@@ -89,7 +94,7 @@ def _index(samples: IntArray, place: Places, length: int, is_cyclic: bool) -> In
     return np.where((0 <= columns) & (columns < length), begin + columns, -1)
 
 
-def _put(out: StepArray, index: IntArray, values: Places) -> None:
+def _put(out: StepArray, index: IntArray, values: Lengths) -> None:
     """Write values at places; of several at one, or where there is one already, the outermost stays."""
     rounded = np.rint(values)
     fits = (index >= 0) & (1 <= rounded) & (rounded <= STEPS_MAX)
@@ -125,8 +130,8 @@ def corrected_cells(
 def correct_texture(texture: ImageArray, steps: StepArray, spec: GridSpec, axis: Axis) -> None:
     """Lay texels where the range samples are now that they were seen with; in place, band by band.
 
-    texture : (Ht, Wt, 3) uint8.  steps : (H, W) uint16, the corrected range. What stands where no range is goes with the
-    range before it in its row.
+    texture : (Ht, Wt, 3) uint8.  steps : (H, W) uint16, the corrected range. What stands where no range is goes with
+    the range before it in its row.
     """
     radii_mm = _usual_radii_mm(steps, spec)
     if radii_mm is None:
@@ -136,15 +141,15 @@ def correct_texture(texture: ImageArray, steps: StepArray, spec: GridSpec, axis:
     above = texture[:0].copy()
     for start in range(0, spec.texture_height, _BAND):
         stop = min(start + _BAND, spec.texture_height)
-        shift = _shift(steps, radii_mm[1], spec, axis, start, stop)
+        along, down = _shift(steps, radii_mm[1], spec, axis, start, stop)
         top = start - len(above)
         source = np.concatenate([above, texture[start : min(stop + reach, spec.texture_height)]])
-        rows = np.arange(start - top, stop - top, dtype=np.float32)[:, None]
-        along = (columns + shift[..., 0]) % np.float32(spec.texture_width)
-        down = np.clip(rows + shift[..., 1], 0, len(source) - 1)
         above = source[max(0, stop - top - reach) : stop - top]
-        padded = cv2.copyMakeBorder(source, 0, 0, 0, 1, cv2.BORDER_WRAP)
-        texture[start:stop] = cv2.remap(padded, along, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        margin = min(math.ceil(float(np.abs(along).max())) + 1, spec.texture_width)
+        wide = cv2.copyMakeBorder(source, 0, 0, margin, margin, cv2.BORDER_WRAP)
+        along += columns + np.float32(margin)
+        down += np.arange(start - top, stop - top, dtype=np.float32)[:, None]
+        texture[start:stop] = cv2.remap(wide, along, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _usual_radii_mm(steps: StepArray, spec: GridSpec) -> tuple[float, float, float] | None:
@@ -154,7 +159,7 @@ def _usual_radii_mm(steps: StepArray, spec: GridSpec) -> tuple[float, float, flo
         return None
     low, high = measured.min(), measured.max()
     middle = np.median(measured[:: max(1, measured.size // 65536)])
-    return tuple(float(value) * spec.step_mm for value in (low, middle, high))
+    return float(low) * spec.step_mm, float(middle) * spec.step_mm, float(high) * spec.step_mm
 
 
 def _reach(radii_mm: tuple[float, float, float], spec: GridSpec, axis: Axis) -> int:
@@ -162,30 +167,40 @@ def _reach(radii_mm: tuple[float, float, float], spec: GridSpec, axis: Axis) -> 
     if not axis.leans:
         return 0
     ends_mm = spec.height_mm(np.array([0.0, spec.height - 1.0]))
-    _, _, z_mm = true_to_seen(axis, *np.broadcast_arrays(np.array(radii_mm)[:, None], ends_mm))
+    _, _, z_mm = true_to_seen(axis, np.array(radii_mm)[:, None], ends_mm)
     texel_mm = spec.pitch_mm * spec.height / spec.texture_height
     return int(np.nanmax(np.abs(z_mm - ends_mm), initial=0.0) / texel_mm) + 2
 
 
-def _shift(steps: StepArray, usual_mm: float, spec: GridSpec, axis: Axis, start: int, stop: int) -> NDArray[np.float32]:
-    """Where texture rows start..stop come from: (n, Wt, 2) float32 columns and rows to add to each texel's own."""
+def _shift(
+    steps: StepArray, usual_mm: float, spec: GridSpec, axis: Axis, start: int, stop: int
+) -> tuple[Lengths, Lengths]:
+    """Where texture rows start..stop come from: columns and rows to add to each texel's own. (n, Wt) float32 each"""
     down, across = spec.height / spec.texture_height, spec.width / spec.texture_width
     low = max(0, math.floor((start + 0.5) * down - 0.5))
     high = min(spec.height, math.ceil((stop - 0.5) * down - 0.5) + 2)
     z_mm = spec.height_mm(np.arange(low, high)).astype(np.float32)[:, None]
     radius_mm = _filled(steps[low:high]) * np.float32(spec.step_mm)
     radius_mm[radius_mm == 0] = usual_mm
-    range_mm, ahead_rad, row_mm = true_to_seen(axis, radius_mm, np.broadcast_to(z_mm, radius_mm.shape))
-    found = np.stack([-ahead_rad * (spec.texture_width / (2 * np.pi)), (z_mm - row_mm) / (spec.pitch_mm * down)], -1)
-    found[np.isnan(range_mm)] = 0
-    wide = cv2.copyMakeBorder(found.astype(np.float32), 0, 0, 1, 1, cv2.BORDER_WRAP)
+    range_mm, ahead_rad, row_mm = true_to_seen(axis, radius_mm, z_mm)
+    misses = np.isnan(range_mm)
+    along = np.where(misses, 0, -ahead_rad * np.float32(spec.texture_width / (2 * np.pi)))
+    rise = np.where(misses, 0, (z_mm - row_mm) / np.float32(spec.pitch_mm * down))
     to_range = np.array([[across, 0, 0.5 * across + 0.5], [0, down, (start + 0.5) * down - 0.5 - low]])
     size, flags = (spec.texture_width, stop - start), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(wide, to_range, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+    def enlarged(shift: Lengths) -> Lengths:
+        wide = cv2.copyMakeBorder(shift, 0, 0, 1, 1, cv2.BORDER_WRAP)
+        large = cv2.warpAffine(wide, to_range, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(large, np.float32)
+
+    return enlarged(along), enlarged(rise)
 
 
-def _filled(steps: StepArray) -> FloatArray:
+def _filled(steps: StepArray) -> Lengths:
     """(n, W) float32 steps, void ones as the last measured one before them in their row; 0 where the row has none."""
+    if steps.all():
+        return steps.astype(np.float32)
     measured = np.where(steps != VOID, np.arange(steps.shape[1], dtype=np.int32), np.int32(-1))
     last = np.maximum.accumulate(measured, axis=1)
     last = np.where(last < 0, last[:, -1:], last)

@@ -1,10 +1,11 @@
 """Where a scanner's axis is, from one sweep of a round body of known diameter that stands off the middle of the table.
 
 Unknown are the axis (node.axis: lateral, radial, lean, side) and the body: where its own axis passes the middle height
-of what was seen (b_x, b_y), and how that leans (t_x, t_y). A sample's place p follows from Eq. (1) and (2) of node.axis;
-its distance from the body's surface is that from the body's axis, less the radius R. What is made least is the error of the
-range, along the ray, since that is what is measured: distances from the surface would be least for a lateral offset
-that noise has shifted. Gauss-Newton on all samples at once, weighted down by Tukey's biweight where they do not fit.
+of what was seen (b_x, b_y), and how that leans (t_x, t_y). A sample's place p follows from Eq. (1) and (2) of
+node.axis; it is outside the body by its distance from the body's axis, less the radius R. What is made least is the
+error of the range, along the ray, since that is what is measured; distances from the surface would be least for a
+lateral offset that noise has shifted. Gauss-Newton on all samples at once, those that do not fit weighted down by
+Tukey's biweight.
 
 What is observable from what: a body whose middle is B off the axis is seen, to second order, at
 
@@ -12,10 +13,11 @@ What is observable from what: a body whose middle is B off the axis is seen, to 
 
 Its mean gives the radial offset, since R is known; its first harmonic gives B and where the body stands; and only how
 the second harmonic is turned against the first, by lateral/R, gives the lateral offset. That falls with (B/R)^2: of a
-body in the middle nothing can be told, so it is refused. The leans are the same at every height, so a body must be high.
-Nothing else of a sweep tells the axis. An overlap sees the same place by the same ray again, and an object that is turned
-about the axis gives the same columns later: both fit every axis alike. What is moved sideways would tell it, if its
-shape were matched to itself; that is this, with a worse body.
+body in the middle nothing can be told, so it is refused. The leans are the same at every height: the body must be high.
+
+Nothing else in a sweep tells the axis. An overlap sees the same place by the same ray again, and an object that is
+turned about the axis gives the same columns later: both fit every axis alike. One that is moved sideways would tell it,
+if its shape were matched to itself; that is this, with a worse body.
 """
 
 from __future__ import annotations
@@ -25,26 +27,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from node.axis import LEAN_MAX_RAD, Axis, seen_to_true, true_to_seen
+from node.axis import LEAN_MAX_RAD, Axis, true_to_seen
 from protocol.errors import FoveascanError
 from protocol.grid import VOID, BoolArray, FloatArray, Grid
 
 SAMPLES_MIN = 2000
 SAMPLES_USED = 60_000  # more tell no more
 TURN_SEEN_MIN = 0.5  # share of the turn
-OFF_CENTRE_MIN = 0.15  # of the radius
-OFFSET_MAX = 0.5  # of the radius
 FITTING_MIN = 0.7  # share of the samples
-SPREAD_MAX = 0.01  # of the radius
-UNEVEN_MAX = 0.002  # of the radius
-UNSURE_MAX = 0.001  # of the radius
+OFF_CENTRE_MIN = 0.15  # of the body's radius, like all that follow
+OFFSET_MAX = 0.5
+SPREAD_MAX = 0.01
+UNEVEN_MAX = 0.002
+UNSURE_MAX = 0.001
 GRAZING = 0.3  # cosine of the steepest incidence that counts
 _ROUNDS = 60
+_STEP_MAX = 0.2  # of the radius, in one round
 _SETTLED = 1e-9
 _TUKEY = 4.685
 _SIGMA_OF_MAD = 1.4826
-_PATCHES = (24, 6)  # round the body, and up it
-PATCH_SAMPLES_MIN = 8
+_PATCHES_ROUND, _PATCHES_UP = 24, 6
+_PATCH_SAMPLES_MIN = 8
 _UNKNOWNS = 8
 _LATERAL, _RADIAL, _LEAN, _SIDE = range(4)
 
@@ -57,9 +60,9 @@ class NotCalibrated(FoveascanError):
 class Estimate:
     """Where the axis is, and how well that is known.
 
-    lateral_error_mm, ... : standard errors, of the offsets at axis.height_mm.  noise_mm : spread of single samples about
-    the body.  uneven_mm : by how much it is no cylinder, as far as that shows.  off_centre_mm : how far off the axis the
-    body stands.  samples : used.  fitting : the share of them that lies on the body.
+    lateral_error_mm and the like : standard errors, of the offsets at axis.height_mm.  noise_mm : spread of single
+    samples about the body.  uneven_mm : by how much it is no cylinder, as far as that shows.  off_centre_mm : how far
+    off the axis it stands.  samples : that were used.  fitting : the share of them that lies on the body.
     """
 
     axis: Axis
@@ -84,33 +87,40 @@ class Samples:
     sin: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """unknowns : as off_surface has them, normal : their (8, 8).  error_mm, on_body : (n,).  spread_mm : of errors."""
+
+    unknowns: FloatArray
+    normal: FloatArray
+    error_mm: FloatArray
+    on_body: BoolArray
+    spread_mm: float
+
+
 def estimate(grid: Grid, diameter_mm: float, corrected_by: Axis | None = None) -> Estimate:
-    """The axis, from a sweep of a round body of that diameter. corrected_by : by what the grid was corrected already.
+    """The axis, from a sweep of a round body of that diameter. corrected_by : what the grid was corrected for already.
 
     Raises NotCalibrated where the sweep does not tell it well enough.
     """
     radius_mm = diameter_mm / 2
-    samples, middle_mm, ends_mm = _samples_of(grid, corrected_by)
-    found, weight, spread_mm, normal = _fitted(samples, radius_mm)
-    error_mm, _ = _range_errors(samples, found, radius_mm)
-    on_body = weight > 0
-    fitting = float(on_body.mean())
-    off_mm = math.hypot(found[4], found[5])
-    _check_body(found, fitting, spread_mm, off_mm, radius_mm)
-    uneven_mm, widening = _patches(samples, error_mm, on_body, spread_mm)
+    samples, middle_mm = _samples_of(grid, corrected_by)
+    fit = _fitted(samples, radius_mm)
+    off_mm, fitting = math.hypot(*fit.unknowns[4:6]), float(fit.on_body.mean())
+    _check_body(fit, fitting, off_mm, radius_mm)
+    uneven_mm, widening = _patches(samples, fit)
     if uneven_mm > UNEVEN_MAX * radius_mm:
         raise NotCalibrated(
-            f"what was seen is no round cylinder of {diameter_mm:g} mm: it differs by {uneven_mm:.3f} mm in large parts;"
-            " use a true one that stands upright, and measure its diameter again"
+            f"what was seen is no round cylinder of {diameter_mm:g} mm: whole parts of it differ by {uneven_mm:.3f} mm;"
+            " use a true one, and measure its diameter again"
         )
-    try:
-        covariance = np.linalg.inv(normal) * (spread_mm * widening) ** 2
-    except np.linalg.LinAlgError:
-        raise NotCalibrated("the axis cannot be told from this body: use a higher one, further off centre") from None
-    _check_sure(covariance, ends_mm - middle_mm, radius_mm)
-    errors = np.sqrt(np.diag(covariance))
-    axis = Axis(*(float(value) for value in found[:4]), height_mm=middle_mm)
-    return Estimate(axis, *(float(e) for e in errors[:4]), spread_mm, uneven_mm, off_mm, len(error_mm), fitting)
+    covariance = _covariance(fit, widening)
+    _check_sure(covariance, grid.spec.height_mm(np.array([0, grid.spec.height - 1])) - middle_mm, radius_mm)
+    lateral, radial, lean, side = fit.unknowns[:4].tolist()
+    axis = Axis(lateral, radial, lean, side, middle_mm)
+    lateral, radial, lean, side = np.sqrt(np.diag(covariance))[:4].tolist()
+    spread_mm, samples_used = fit.spread_mm, len(fit.error_mm)
+    return Estimate(axis, lateral, radial, lean, side, spread_mm, uneven_mm, off_mm, samples_used, fitting)
 
 
 def off_surface(
@@ -131,12 +141,12 @@ def off_surface(
     p_z = level * cos_side - lateral * sin_side
     away_x = p_x * cos - p_y * sin - b_x - p_z * t_x
     away_y = p_x * sin + p_y * cos - b_y - p_z * t_y
-    along, square = away_x * t_x + away_y * t_y, 1 + t_x * t_x + t_y * t_y
-    distance = np.sqrt(np.maximum(away_x**2 + away_y**2 - along**2 / square, 1e-12))
-    g_x, g_y = (away_x - t_x * along / square) / distance, (away_y - t_y * along / square) / distance
+    along = (away_x * t_x + away_y * t_y) / (1 + t_x * t_x + t_y * t_y)
+    from_x, from_y = away_x - t_x * along, away_y - t_y * along
+    distance = np.sqrt(np.maximum(from_x * from_x + from_y * from_y + along * along, 1e-12))
+    g_x, g_y, g_z = from_x / distance, from_y / distance, along / distance  # out of the surface
     by_x, by_y, by_z = g_x * cos + g_y * sin, g_y * cos - g_x * sin, -(g_x * t_x + g_y * t_y)
     by_level = by_y * sin_side + by_z * cos_side
-    tilted = along / square / distance
     slopes = np.stack([
         by_y * cos_side - by_z * sin_side,
         by_x * cos_lean - by_level * sin_lean,
@@ -144,20 +154,20 @@ def off_surface(
         by_y * p_z - by_z * p_y,
         -g_x,
         -g_y,
-        -p_z * g_x - tilted * (away_x - t_x * along / square),
-        -p_z * g_y - tilted * (away_y - t_y * along / square),
+        -p_z * g_x - g_z * from_x,
+        -p_z * g_y - g_z * from_y,
     ], axis=1)  # fmt: skip
     return distance - radius_mm, slopes
 
 
-def _samples_of(grid: Grid, corrected_by: Axis | None) -> tuple[Samples, float, FloatArray]:
-    """The measured samples of a grid, thinned; the middle of their heights, and those of the grid's ends [mm]."""
+def _samples_of(grid: Grid, corrected_by: Axis | None) -> tuple[Samples, float]:
+    """What was measured of a grid, thinned, as the sensor saw it; and the middle of the heights. [mm]"""
     spec = grid.spec
     measured = grid.range_steps != VOID
     measured[tuple(grid.repairs[:, :2].T)] = False
     rows, columns = np.nonzero(measured)
     if rows.size < SAMPLES_MIN:
-        raise NotCalibrated(f"only {rows.size} samples of range, at least {SAMPLES_MIN} are needed: is the body in view?")
+        raise NotCalibrated(f"only {rows.size} samples of range, {SAMPLES_MIN} are needed: is the body in view?")
     seen = measured.any(axis=0).mean()
     if seen < TURN_SEEN_MIN:
         raise NotCalibrated(f"the body was seen in {100 * seen:.0f} % of the turn only: move it nearer to the middle")
@@ -166,28 +176,32 @@ def _samples_of(grid: Grid, corrected_by: Axis | None) -> tuple[Samples, float, 
     range_mm, height_mm = grid.range_steps[rows, columns] * spec.step_mm, spec.height_mm(rows)
     angle_rad = spec.angle_rad(columns)
     if corrected_by is not None:
-        range_mm, ahead_rad, height_mm = true_to_seen(corrected_by, range_mm, height_mm)
-        has = np.isfinite(range_mm)
-        range_mm, height_mm, angle_rad = range_mm[has], height_mm[has], (angle_rad - ahead_rad)[has]
+        found = np.array(true_to_seen(corrected_by, range_mm, height_mm))
+        has = np.isfinite(found[0])
+        range_mm, ahead_rad, height_mm = found[:, has]
+        angle_rad = angle_rad[has] - ahead_rad
     middle_mm = float(np.median(height_mm))
-    ends_mm = spec.height_mm(np.array([0, spec.height - 1]))
-    return Samples(range_mm, height_mm - middle_mm, np.cos(angle_rad), np.sin(angle_rad)), middle_mm, ends_mm
+    above_mm = height_mm - middle_mm
+    return Samples(np.asarray(range_mm, np.float64), above_mm, np.cos(angle_rad), np.sin(angle_rad)), middle_mm
 
 
-def _fitted(samples: Samples, radius_mm: float) -> tuple[FloatArray, FloatArray, float, FloatArray]:
-    """The unknowns, the weights (n,), the spread of what fits [mm], and the normal matrix (8, 8)."""
-    found = np.concatenate([np.zeros(4), _about(samples), np.zeros(2)])
-    scale = np.array([1, 1, 1 / radius_mm, 1 / radius_mm, 1, 1, 1 / radius_mm, 1 / radius_mm]) * radius_mm
+def _fitted(samples: Samples, radius_mm: float) -> _Fit:
+    """The unknowns for which the samples' errors are least. Raises NotCalibrated where there are none."""
+    unknowns = np.concatenate([np.zeros(4), _about(samples), np.zeros(2)])
+    scale = np.array([radius_mm, radius_mm, 1, 1, radius_mm, radius_mm, 1, 1])
     for _ in range(_ROUNDS):
-        error_mm, slopes = _range_errors(samples, found, radius_mm)
+        error_mm, slopes = _range_errors(samples, unknowns, radius_mm)
         spread_mm = max(_SIGMA_OF_MAD * float(np.median(np.abs(error_mm))), 1e-6)
+        if not math.isfinite(spread_mm):
+            break
         weight = np.maximum(1 - (error_mm / (_TUKEY * spread_mm)) ** 2, 0) ** 2
+        error_mm = np.where(weight > 0, error_mm, 0)
         weighted = slopes * weight[:, None]
         normal = weighted.T @ slopes
         step = np.linalg.lstsq(normal * np.outer(scale, scale), -scale * (weighted.T @ error_mm), rcond=1e-14)[0]
-        found = found + scale * np.clip(step, -0.2, 0.2)
+        unknowns = unknowns + scale * np.clip(step, -_STEP_MAX, _STEP_MAX)
         if np.abs(step).max() < _SETTLED:
-            return found, weight, spread_mm, normal
+            return _Fit(unknowns, normal, error_mm, weight > 0, spread_mm)
     raise NotCalibrated("what was seen fits no round body: take away what else stands in view, and sweep again")
 
 
@@ -197,11 +211,9 @@ def _range_errors(samples: Samples, unknowns: FloatArray, radius_mm: float) -> t
     inf where a ray only grazes the body, or misses it.
     """
     off_mm, slopes = off_surface(samples, samples.range_mm, unknowns, radius_mm)
-    steep = np.maximum(slopes[:, _RADIAL], GRAZING)
-    met_mm = samples.range_mm - off_mm / steep  # on the surface, all but a square of the error
+    met_mm = samples.range_mm - off_mm / np.maximum(slopes[:, _RADIAL], GRAZING)  # but for a square of the error
     off_mm, slopes = off_surface(samples, met_mm, unknowns, radius_mm)
-    grazes = slopes[:, _RADIAL] < GRAZING
-    steep = np.maximum(slopes[:, _RADIAL], GRAZING)
+    grazes, steep = slopes[:, _RADIAL] < GRAZING, np.maximum(slopes[:, _RADIAL], GRAZING)
     slopes[grazes] = 0
     return np.where(grazes, np.inf, samples.range_mm - met_mm + off_mm / steep), slopes / steep[:, None]
 
@@ -215,51 +227,38 @@ def _about(samples: Samples) -> FloatArray:
         harmonic = np.linalg.lstsq(weighted.T @ terms, weighted.T @ samples.range_mm, rcond=None)[0]
         off_mm = np.abs(samples.range_mm - terms @ harmonic)
         weight = 1 / np.maximum(off_mm, 0.1 * np.median(off_mm) + 1e-9)
-    return np.asarray(harmonic[:2])
+    return np.asarray(harmonic[:2], np.float64)
 
 
-def _check_body(found: FloatArray, fitting: float, spread_mm: float, off_mm: float, radius_mm: float) -> None:
+def _check_body(fit: _Fit, fitting: float, off_mm: float, radius_mm: float) -> None:
     """Raises NotCalibrated for a body that is not as it was said, or stands where it tells little."""
+    body = f"a cylinder of {2 * radius_mm:g} mm"
     if fitting < FITTING_MIN:
         raise NotCalibrated(
-            f"only {100 * fitting:.0f} % of what was seen lies on a cylinder of {2 * radius_mm:g} mm: take away what else"
-            " stands in view, or measure its diameter again"
+            f"only {100 * fitting:.0f} % of what was seen lies on {body}: take away what else stands in view, or"
+            " measure its diameter again"
         )
-    if spread_mm > SPREAD_MAX * radius_mm:
+    if fit.spread_mm > SPREAD_MAX * radius_mm:
         raise NotCalibrated(
-            f"samples lie {spread_mm:.3f} mm off a cylinder of {2 * radius_mm:g} mm, at most {SPREAD_MAX * radius_mm:.3f}"
-            " are taken: is it round, matt, and its diameter right?"
+            f"samples lie {fit.spread_mm:.3f} mm off {body}, at most {SPREAD_MAX * radius_mm:.3f} are taken: is it"
+            " round, matt, and its diameter right?"
         )
-    if max(abs(found[_LATERAL]), abs(found[_RADIAL])) > OFFSET_MAX * radius_mm:
+    lateral, radial, lean, side = fit.unknowns[:4]
+    if max(abs(lateral), abs(radial)) > OFFSET_MAX * radius_mm:
         raise NotCalibrated(
-            f"the axis would be {found[_LATERAL]:.1f} mm and {found[_RADIAL]:.1f} mm off, too far to be believed: is the"
-            f" diameter {2 * radius_mm:g} mm?"
+            f"the axis would be {lateral:.1f} mm and {radial:.1f} mm off, too far to be believed: is the diameter"
+            f" {2 * radius_mm:g} mm?"
         )
-    if max(abs(found[_LEAN]), abs(found[_SIDE])) > LEAN_MAX_RAD:
-        raise NotCalibrated("the axis would lean by more than 5 degrees: does the body stand upright, and is it round?")
+    if max(abs(lean), abs(side)) > LEAN_MAX_RAD:
+        raise NotCalibrated("the axis would lean by over 5 degrees: is the body round, and does it stand upright?")
     if off_mm < OFF_CENTRE_MIN * radius_mm:
         raise NotCalibrated(
-            f"the body stands {off_mm:.1f} mm off the axis, too near to tell where that is: move it until it stands about"
-            f" {radius_mm / 2:.0f} mm off"
+            f"the body stands {off_mm:.1f} mm off the axis, too near to tell where that is: move it until it stands"
+            f" about {radius_mm / 2:.0f} mm off"
         )
 
 
-def _check_sure(covariance: FloatArray, heights_mm: FloatArray, radius_mm: float) -> None:
-    """Raises NotCalibrated where the offsets are not known well enough from the lowest row to the highest."""
-    worst = 0.0
-    for offset, lean in ((_LATERAL, _SIDE), (_RADIAL, _LEAN)):
-        both = covariance[np.ix_([offset, lean], [offset, lean])]
-        for height_mm in heights_mm:
-            along = np.array([1.0, height_mm])
-            worst = max(worst, float(along @ both @ along))
-    if not math.sqrt(worst) <= UNSURE_MAX * radius_mm:
-        raise NotCalibrated(
-            f"the axis is known to {math.sqrt(worst):.3f} mm only, at most {UNSURE_MAX * radius_mm:.3f} are taken: use a"
-            " higher body further off centre, or average several passes"
-        )
-
-
-def _patches(samples: Samples, error_mm: FloatArray, on_body: BoolArray, spread_mm: float) -> tuple[float, float]:
+def _patches(samples: Samples, fit: _Fit) -> tuple[float, float]:
     """By how much whole patches of the body lie off it [mm], and how many times as much as by chance, at least 1.
 
     Errors of neighbouring samples may hang together: what that adds to the scatter of patches, it adds to the errors.
@@ -267,14 +266,33 @@ def _patches(samples: Samples, error_mm: FloatArray, on_body: BoolArray, spread_
     turn = (np.arctan2(samples.sin, samples.cos) / (2 * np.pi)) % 1
     low, high = samples.height_mm.min(), samples.height_mm.max()
     up = (samples.height_mm - low) / max(high - low, 1e-9)
-    round_, high_ = _PATCHES
-    index = np.minimum((turn * round_).astype(np.int64), round_ - 1) * high_
-    index += np.minimum((up * high_).astype(np.int64), high_ - 1)
-    count = np.bincount(index[on_body], minlength=round_ * high_)
-    total = np.bincount(index[on_body], error_mm[on_body], minlength=round_ * high_)
-    has = count >= PATCH_SAMPLES_MIN
-    mean = total[has] / count[has]
-    chance = spread_mm**2 / count[has]
-    uneven_mm = math.sqrt(max(0.0, float(np.mean(mean**2 - chance))))
-    widening = math.sqrt(max(1.0, float((mean**2 / chance).sum()) / max(1, int(has.sum()) - _UNKNOWNS)))
-    return uneven_mm, widening
+    index = np.minimum((turn * _PATCHES_ROUND).astype(np.int64), _PATCHES_ROUND - 1) * _PATCHES_UP
+    index += np.minimum((up * _PATCHES_UP).astype(np.int64), _PATCHES_UP - 1)
+    count = np.bincount(index[fit.on_body])
+    total = np.bincount(index[fit.on_body], fit.error_mm[fit.on_body])
+    has = count >= _PATCH_SAMPLES_MIN
+    square, chance = (total[has] / count[has]) ** 2, fit.spread_mm**2 / count[has]
+    uneven_mm = math.sqrt(max(0.0, float(np.mean(square - chance))))
+    return uneven_mm, math.sqrt(max(1.0, float((square / chance).sum()) / max(1, int(has.sum()) - _UNKNOWNS)))
+
+
+def _covariance(fit: _Fit, widening: float) -> FloatArray:
+    """(8, 8) of the unknowns. Raises NotCalibrated where they cannot be told apart."""
+    try:
+        return np.asarray(np.linalg.inv(fit.normal) * (fit.spread_mm * widening) ** 2, np.float64)
+    except np.linalg.LinAlgError:
+        raise NotCalibrated("the axis cannot be told from this body: use a higher one, further off centre") from None
+
+
+def _check_sure(covariance: FloatArray, heights_mm: FloatArray, radius_mm: float) -> None:
+    """Raises NotCalibrated where the offsets are not known well enough from the lowest row to the highest."""
+    squares = []
+    for offset, lean in ((_LATERAL, _SIDE), (_RADIAL, _LEAN)):
+        both = covariance[np.ix_([offset, lean], [offset, lean])]
+        squares += [np.array([1.0, height_mm]) @ both @ np.array([1.0, height_mm]) for height_mm in heights_mm]
+    error_mm = math.sqrt(max(0.0, *(float(square) for square in squares)))
+    if not error_mm <= UNSURE_MAX * radius_mm:
+        raise NotCalibrated(
+            f"the axis is known to {error_mm:.3f} mm only, at most {UNSURE_MAX * radius_mm:.3f} are taken: use a higher"
+            " body further off centre, or average several passes"
+        )

@@ -28,6 +28,7 @@ from drivers.scanner import (
     SweepStarted,
 )
 from node.assemble import Assembly
+from node.axes import Axes
 from node.journal import Journals
 from node.resume import cut_lately, publish, resumed, resumed_by_itself
 from node.running_sweep import RunningSweep
@@ -120,6 +121,7 @@ class Capture:
     watch : told of every event of a sweep, in the capture thread. A sweep whose grid is not delivered ends in
     SweepInterrupted for it, whatever the scanner said.
     sweeps : where columns are kept until their grid is delivered; without it, a cut sweep is lost.
+    axes : what is known of scanners' axes, which grids are corrected for.
     """
 
     def __init__(
@@ -130,6 +132,7 @@ class Capture:
         watch: Callable[[SweepEvent], None] = lambda event: None,
         sweeps: Journals | None = None,
         manner: Manner = Manner(),
+        axes: Axes | None = None,
     ) -> None:
         self._open_port = open_port
         self._config = config
@@ -137,6 +140,7 @@ class Capture:
         self._watch = watch
         self._sweeps = sweeps
         self._manner = manner
+        self._axes = axes
         self._beat_s = time.monotonic()
         self.counts = SweepCounts()  # of the capture thread; others only look
         self._stop = threading.Event()
@@ -277,7 +281,7 @@ class Capture:
                 case Manner(request, apart, repairs):
                     if self._sweeps is not None:
                         self._sweeps.require_room()
-                    running = RunningSweep(self._sweeps, info, repairs=repairs)
+                    running = RunningSweep(self._sweeps, info, repairs=repairs, axes=self._axes)
                     self._run_sweep(swept(scanner, request, self._stop, apart=apart), running)
                 case _Resume():
                     self._resume(scanner, info, order)
@@ -292,13 +296,15 @@ class Capture:
         held = list(self._sweeps.columns(sweep.id))
         if sweep.is_complete:
             with self._delivering():
-                publish(self._sweeps, sweep, self._deliver, self._manner.repairs)
+                publish(self._sweeps, sweep, self._deliver, self._manner.repairs, self._axes)
             return
         if order.by_itself:
             events = resumed_by_itself(scanner, sweep, held, self._stop)
         else:
             events = resumed(scanner, info, sweep, held, self._stop)
-        self._run_sweep(events, RunningSweep(self._sweeps, info, sweep.id, held, repairs=self._manner.repairs))
+        repairs = self._manner.repairs
+        running = RunningSweep(self._sweeps, info, sweep.id, held, repairs=repairs, axes=self._axes)
+        self._run_sweep(events, running)
 
     def _run_sweep(self, events: TurnEvents, running: RunningSweep) -> None:
         """One sweep, from its header to the grid that it makes. Raises DriverError.

@@ -121,7 +121,9 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
     def keep(assembly: Assembly) -> None:
         finished.append(_keep(library, assembly))
 
-    for said in await asyncio.to_thread(publish_complete, library.sweeps, keep, config.capture.repair):
+    for said in await asyncio.to_thread(
+        publish_complete, library.sweeps, keep, config.capture.repair, library.axes
+    ):
         log.warning("library: %s", said)
     way = RightOfWay()
     exhibits = Exhibits(library, config.first_view.max_bytes, config.server.encode_workers, way)
@@ -158,7 +160,8 @@ def _entrance(config: Config, library: Path, node_id: str) -> tuple[Access | Non
 
 
 def _keep(library: Library, assembly: Assembly) -> Scan:
-    return library.add(assembly.grid, About(time.time(), quality=assembly.quality))
+    scanner, settings = assembly.scanner, assembly.settings
+    return library.add(assembly.grid, About(time.time(), quality=assembly.quality, scanner=scanner, settings=settings))
 
 
 def _capture(
@@ -185,7 +188,7 @@ def _capture(
 
     opened = partial(open_port, address, config.capture.baud)
     link = config_for(address, config.capture.stale_s)
-    capture = Capture(opened, link, deliver, watch, library.sweeps, manner_of(config))
+    capture = Capture(opened, link, deliver, watch, library.sweeps, manner_of(config), library.axes)
     return capture, announce
 
 

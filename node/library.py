@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from node import archive
+from node.axes import Axes
 from node.coarse import FIRST_VIEW_BYTES, Coarse, build_coarse, build_pyramid, fill_voids
 from node.durable import disk_error, sync_folder
 from node.journal import Journals
@@ -99,7 +100,7 @@ class Library:
     """The scans in one folder, which is made if it is missing. Safe to use from several threads of one process.
 
     first_view_bytes : how large the first views may be.  open_max : opened scans kept ready, at least 1.
-    sweeps : the journals kept here.  found : what the start made good after a crash.
+    sweeps : the journals kept here.  axes : those of the scanners.  found : what the start made good after a crash.
     Raises LibraryError when the folder cannot be used: another process has it, or a newer version wrote it.
     """
 
@@ -114,6 +115,7 @@ class Library:
         try:
             self.found = tidy(folder)
             self.sweeps = Journals(folder / SWEEPS)
+            self.axes = Axes(folder)
             self._known, problems = survey(folder)
         except OSError as error:
             raise disk_error(f"the library {folder} cannot be used", error) from error

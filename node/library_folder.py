@@ -3,6 +3,7 @@
     <library>/library.json   {"format": 1}: written first, so that no version works on a folder that it does not know
               lock           held by the one process that may write here; it holds the process's number
               sweeps/        journals (node.journal)
+              axes.json      where the axes of scanners are (node.axes)
               .incoming-*    a scan that is being written          the next start removes it
               .trash-*       a scan that is being deleted          the next start removes it
               .restore-*     a backup that is being unpacked       the next start finishes it, if checked, or removes it
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import msgspec
 
+from node.axes import FILE as AXES
 from node.durable import NEW, decode_kept, disk_error, read_bounded, sync_folder, write_whole
 from node.scan_folder import INCOMING, RANGE_FILE, RECORD_FILE, REPAIRS_FILE, SCAN_ID, TEXTURE_FILE
 from node.sidecar import FILE as SIDECAR_FILE
@@ -24,7 +26,7 @@ from protocol.errors import LibraryError
 
 FORMAT = 1
 MARK_FILE, LOCK_FILE, SWEEPS = "library.json", "lock", "sweeps"
-OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, "node-id", "access", "audit"})  # node.identity, node.access, node.audit
+OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, AXES, "node-id", "access", "audit"})  # those of node.identity, too
 TRASH, RESTORE = ".trash-", ".restore-"
 UNFINISHED = (INCOMING, TRASH, RESTORE)
 CHECKED = "checked"  # in a .restore- folder: everything in it was unpacked and found sound

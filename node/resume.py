@@ -14,6 +14,7 @@ from dataclasses import replace
 from drivers.ledger import Ledger
 from drivers.scanner import Scanner, SweepEvent, SweepFinished, SweepInterrupted, SweepReport, SweepStarted
 from node.assemble import Assembler, Assembly
+from node.axes import Axes
 from node.journal import Interrupted, Journals
 from node.resampling import Encoder
 from node.turns import STOPPED, TurnEvents, TurnStarted, as_of_sweep, gone_on
@@ -82,32 +83,55 @@ def cut_lately(sweeps: Sequence[Interrupted], info: DeviceInfo, now_unix_s: floa
     return None
 
 
-def publish_complete(sweeps: Journals, deliver: Callable[[Assembly], object], repairs: bool = True) -> list[str]:
+def publish_complete(
+    sweeps: Journals, deliver: Callable[[Assembly], object], repairs: bool = True, axes: Axes | None = None
+) -> list[str]:
     """Make scans of the complete sweeps that a crash kept from becoming ones. Returns what was done, or went wrong.
 
-    deliver, repairs : as for publish.
+    deliver, repairs, axes : as for publish.
     """
     said = []
     for sweep in filter(lambda sweep: sweep.is_complete, sweeps.interrupted()):
         try:
-            publish(sweeps, sweep, deliver, repairs)
+            publish(sweeps, sweep, deliver, repairs, axes)
             said.append(f"published sweep {sweep.id}, which was complete")
         except (FoveascanError, ValueError) as error:
             said.append(f"could not publish sweep {sweep.id}: {error}")
     return said
 
 
-def publish(sweeps: Journals, sweep: Interrupted, deliver: Callable[[Assembly], object], repairs: bool = True) -> None:
+def publish(
+    sweeps: Journals,
+    sweep: Interrupted,
+    deliver: Callable[[Assembly], object],
+    repairs: bool = True,
+    axes: Axes | None = None,
+) -> None:
     """Make a scan of one complete sweep.
 
-    deliver : returns once it is durable.  repairs : whether spikes are taken out and small holes filled.
+    deliver : returns once it is durable.  repairs, axes : as for assembled.
     Raises FoveascanError, ValueError.
     """
     assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
     for column in sweeps.columns(sweep.id):
         add_column(assembler, column)
-    deliver(assembler.assembly(repairs=repairs, apart=sweep.turn is not None))
+    apart = sweep.turn is not None
+    deliver(assembled(assembler, sweep.info, sweep.header, axes, repairs=repairs, apart=apart))
     sweeps.delete(sweep.id)
+
+
+def assembled(
+    assembler: Assembler, info: DeviceInfo, header: SweepHeader, axes: Axes | None, *, repairs: bool, apart: bool
+) -> Assembly:
+    """What became of a sweep whose columns are all in, with who swept it. Raises IncompleteTurn.
+
+    axes : what is known of the scanner's axis; the grid is corrected for it.  repairs : whether spikes are taken out
+    and small holes filled.  apart : range and texture were not seen at the same time.
+    """
+    axis, trouble = axes.of(info.serial_number, header.calibration) if axes else (None, "")
+    assembly = assembler.assembly(repairs=repairs, apart=apart, axis=axis)
+    quality = replace(assembly.quality, axis_trouble=trouble)
+    return replace(assembly, quality=quality, scanner=info.serial_number, settings=header.calibration)
 
 
 def encoder_of(header: SweepHeader) -> Encoder:

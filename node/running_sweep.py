@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from drivers.scanner import SweepReport
 from node.assemble import Assembler, Assembly
+from node.axes import Axes
 from node.journal import Journal, Journals
-from node.resume import add_column, encoder_of
+from node.resume import add_column, assembled, encoder_of
 from node.turns import TurnStarted
 from protocol.errors import RemoteWireError, ScannerFault
 from protocol.scanner_messages import Column, DeviceInfo, Outcome, SweepEnd, SweepHeader
@@ -20,7 +21,7 @@ class RunningSweep:
 
     sweeps : where journals are; None: nothing is kept.  info : the scanner.
     sweep_id, held : the interrupted sweep that goes on, and its columns; None and nothing for a new one.
-    repairs : whether spikes are taken out and small holes filled.
+    repairs : whether spikes are taken out and small holes filled.  axes : what is known of the scanner's axis.
     """
 
     def __init__(
@@ -31,14 +32,16 @@ class RunningSweep:
         held: Sequence[Column] = (),
         *,
         repairs: bool = True,
+        axes: Axes | None = None,
     ) -> None:
         self.held = held
         self._repairs = repairs
+        self._axes = axes
         self._sweeps = sweeps
         self._info = info
         self._sweep_id = sweep_id
         self._journal: Journal | None = None
-        self._sweep = 0
+        self._header: SweepHeader | None = None
         self._has_turns = False
         self._assembler: Assembler | None = None
 
@@ -48,7 +51,7 @@ class RunningSweep:
             self._assembler = Assembler(header.spec, encoder_of(header))
         except ValueError as error:
             raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
-        self._sweep = header.sweep
+        self._header = header
         if self._sweeps is not None and self._sweep_id is not None:
             self._journal = self._sweeps.reopen(self._sweep_id)
         elif self._sweeps is not None:
@@ -75,14 +78,16 @@ class RunningSweep:
 
     def finish(self, deliver: Callable[[Assembly], None], report: SweepReport) -> None:
         """Every column is in: deliver the grid. Raises FoveascanError; then the journal is still there."""
-        assert self._assembler is not None
+        assert self._assembler is not None and self._header is not None
         self.flush()
-        assembly = self._assembler.assembly(repairs=self._repairs, apart=self._has_turns)
+        assembly = assembled(
+            self._assembler, self._info, self._header, self._axes, repairs=self._repairs, apart=self._has_turns
+        )
         quality = replace(
             assembly.quality, requested_columns=report.requested_columns, dropped_bytes=report.dropped_bytes
         )
         if self._journal is not None:
-            self._journal.confirm(SweepEnd(self._sweep, Outcome.COMPLETE, report.received, report.digest))
+            self._journal.confirm(SweepEnd(self._header.sweep, Outcome.COMPLETE, report.received, report.digest))
             self._journal.close()
         deliver(replace(assembly, quality=quality))
         if self._journal is not None and self._sweeps is not None:

@@ -53,7 +53,8 @@ class About:
     created_unix_s : the node's clock, for people; it orders nothing.  source : "sweep", "import" or "derived".
     name : what to call it, at most 200 characters.  quality : what the sweep was worth, None of a scan that came as a
     file, or from a version that did not keep it.  note : how it was made where it was not measured so, and what of it
-    is made up; at most 1000 characters.  made_from : the ids of the scans it was made of.
+    is made up; at most 1000 characters.  made_from : the ids of the scans it was made of.  scanner, settings : the
+    serial number of who swept it, and the number of its calibration then; "" where that is not known.
     Raises ValueError when out of bounds.
     """
 
@@ -63,13 +64,15 @@ class About:
     quality: ScanQuality | None = None
     note: str = ""
     made_from: tuple[str, ...] = ()
+    scanner: str = ""
+    settings: int = 0
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.created_unix_s):
             raise ValueError(f"created_unix_s must be finite, got {self.created_unix_s}")
         if len(self.note) > NOTE_MAX or len(self.made_from) > MADE_FROM_MAX:
             raise ValueError(f"a note of {len(self.note)} characters, or {len(self.made_from)} scans it was made of")
-        for text in (self.source, self.name, *self.made_from):
+        for text in (self.source, self.name, self.scanner, *self.made_from):
             if len(text) > TEXT_MAX:
                 raise ValueError(f"a text of {len(text)} characters, at most {TEXT_MAX} are kept")
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from node.axis import Axis
+from protocol import quality as said
 from protocol.grid import VOID, BoolArray, FloatArray, Grid, ImageArray, StepArray
 
 _SATURATED = 255
@@ -24,6 +26,7 @@ class ScanQuality:
     between measured ones of their column.  dead_rows : void rows between measured ones.  saturated_columns : texture
     columns without any drawing.  slip_deg : how far the object had moved when it was seen again, None if it cannot be
     told.  set_aside : passes left out because of that.  requested_columns, dropped_bytes : what the line lost.
+    axis : where the table's axis is, if the grid was corrected for that.  axis_trouble : why it was not, and should be.
     """
 
     coverage: float
@@ -40,11 +43,14 @@ class ScanQuality:
     set_aside: int = 0
     requested_columns: int = 0
     dropped_bytes: int = 0
+    axis: Axis | None = None
+    axis_trouble: str = ""
 
     @property
     def complaints(self) -> tuple[str, ...]:
         """What a person should know before trusting the scan, in words; nothing when all is well."""
-        said = [
+        found = [
+            (self.axis_trouble, self.axis_trouble),
             (self.has_slipped, f"something moved by {self.slip_deg or 0.0:.2f} degrees during the sweep"),
             (self.set_aside, f"{self.set_aside} passes do not fit the first one and were left out"),
             (self.spikes, f"{self.spikes} spikes were taken out"),
@@ -53,7 +59,13 @@ class ScanQuality:
             (self.dead_rows, f"{self.dead_rows} rows of the range camera measure nothing"),
             (self.saturated_columns, f"{self.saturated_columns} texture columns are saturated"),
         ]
-        return tuple(words for holds, words in said if holds)
+        return tuple(words for holds, words in found if holds)
+
+
+def told(quality: ScanQuality) -> said.ScanQuality:
+    """The same, as clients are told."""
+    axis = quality.axis and said.AxisOffset(**asdict(quality.axis))
+    return said.ScanQuality(**{**asdict(quality), "axis": axis}, complaints=quality.complaints)
 
 
 def coverage_of(steps: StepArray) -> float:

@@ -17,6 +17,7 @@ from node.access import Access
 from node.audit import NODE, Audit, Who
 from node.audit_routes import SCAN, AuditRoutes
 from node.auth import CHALLENGE, LOGIN, Auth, Refusal
+from node.axis_routes import AxisRoutes
 from node.bodies import CoarseQuery, ListedScan, NodeStatus, ScanDetail, SweepAsked
 from node.capture import Capture, CaptureStatus
 from node.config import Config
@@ -39,6 +40,7 @@ from node.pairing import PairingRoutes
 from node.proxy import believe
 from node.rest import harden, query_of, refusal, said
 from node.retention import delete, expired_in
+from node.scan_quality import told
 from node.shared import SharedFoveae
 from node.tls import Tls
 from protocol import messages as m
@@ -117,6 +119,7 @@ class NodeServer:
             *self._shared.routes(),
             *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
             *self.derivation.routes(),
+            *AxisRoutes(exhibits.library).routes(),
             *pairing.routes(),
             *audit_routes.routes(),
             *health.routes(),
@@ -283,8 +286,7 @@ class NodeServer:
     async def _scan(self, request: web.Request) -> web.Response:
         scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
         request[SCAN] = scan.id
-        found = scan.about.quality
-        quality = m.ScanQuality(**asdict(found), complaints=found.complaints) if found else None
+        quality = scan.about.quality and told(scan.about.quality)
         known = structs.asdict(scan_info(scan))
         return said(ScanDetail(**known, quality=quality, note=scan.about.note, made_from=scan.about.made_from))
 

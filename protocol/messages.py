@@ -45,35 +45,6 @@ class _Part(msgspec.Struct, frozen=True, rename="camel", omit_defaults=True):
     """A record inside a message."""
 
 
-class ScanQuality(_Part, frozen=True):
-    """What a scan is worth, beside GET /v1/scans/{id}; no part of the stream.
-
-    coverage : share of range cells measured.  passes : looks that were averaged.  noise_mm : standard deviation of a
-    single range sample, None where nothing was seen twice.  spikes : samples taken out.  rejected : samples that
-    disagreed with other passes.  filled : cells of small holes that were made up.  holes : void cells between measured
-    ones of their column.  dead_rows, saturated_columns : rows of range that measured nothing, columns of texture
-    without drawing.  slip_deg : how far the object had moved when it was seen again, None where it was not.
-    set_aside : passes left out because of that.  requested_columns, dropped_bytes : what the scanner's line lost.
-    complaints : what of this a person should know, in words; nothing when all is well.
-    """
-
-    coverage: Annotated[float, Meta(ge=0, le=1)]
-    passes: Count = 1
-    noise_mm: float | None = None
-    spikes: Count = 0
-    rejected: Count = 0
-    filled: Count = 0
-    holes: Count = 0
-    dead_rows: Count = 0
-    saturated_columns: Count = 0
-    slip_deg: float | None = None
-    has_slipped: bool = False
-    set_aside: Count = 0
-    requested_columns: Count = 0
-    dropped_bytes: ByteCount = 0
-    complaints: Annotated[tuple[ShortText, ...], Meta(max_length=32)] = ()
-
-
 class _Message(_Part, frozen=True, tag_field="type", tag=lambda name: name[0].lower() + name[1:]):
     """Base of all messages."""
 

@@ -22,7 +22,7 @@ BITS_PER_BYTE = 10  # on a serial line: start, eight data, stop
 BAUD = 3_000_000
 USB_BYTES_S = 35e6
 USB_PORTION_BYTES = 253_000  # with a column more it fills one read of the node, as a device that has more to send does
-SPECIMEN_HELP = "head, nutcracker, sphere, cylinder, pebble, or a .npz grid, mesh or Echo file (head)"
+SPECIMEN_HELP = "head, nutcracker, sphere, cylinder, post, pebble, or a .npz grid, mesh or Echo file (head)"
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -73,6 +73,11 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     simulate.add_argument(
         "--retention", type=_whole(1, 65535), default=65535, help="columns held to be sent again (65535)"
     )
+    simulate.add_argument(
+        "--axis",
+        metavar="LATERAL,RADIAL[,LEAN,SIDE]",
+        help="where the table's axis is, beside the one that the sensor believes in, in mm and degrees (0,0)",
+    )
     simulate.add_argument("--serial-number", default="SIM-0001", help="of the scanner (SIM-0001)")
     simulate.add_argument("--truth", type=Path, metavar="FILE", help="write what the node should see, as a .npz grid")
     simulate.add_argument(
@@ -90,7 +95,7 @@ def run_simulate(args: argparse.Namespace) -> int:
     from simulators.specimen import make_specimen
 
     specimen = make_specimen(args.specimen, args.size, args.texture, args.seed)
-    scanner = _scanner(args, specimen)
+    scanner = _scanner(args, _as_seen(args, specimen))
     for path, grid in ((args.truth, specimen.grid), (args.closed, specimen.closed)):
         if path is not None and grid is not None:
             with whole_file(path) as file:
@@ -100,6 +105,16 @@ def run_simulate(args: argparse.Namespace) -> int:
         print(_ready(args, specimen, about), flush=True)
         serve(scanner, port, stop, portion)
     return 0
+
+
+def _as_seen(args: argparse.Namespace, specimen: Specimen) -> Specimen:
+    """What the scanner sees of it: another thing where the axis is off centre. Raises UsageError."""
+    from simulators.off_axis import parse_off_axis, seen_off_axis
+    from simulators.specimen import Specimen
+
+    if args.axis is None:
+        return specimen
+    return Specimen(specimen.name, seen_off_axis(specimen.grid, parse_off_axis(args.axis)))
 
 
 def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:

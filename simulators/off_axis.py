@@ -25,9 +25,8 @@ _TILT_MAX_DEG = 3.0
 class OffAxis:
     """Where the table's axis is, as the sensor sees it.
 
-    lateral_mm : its line of sight passes the axis this far to the left, seen from the sensor's back over the table
-    towards it... towards +y where the sensor stands at +x.  radial_mm : its range is too short by this much.
-    lean_deg, side_deg : the axis is tilted; both offsets grow with height above 0 by the tangents.
+    lateral_mm : its line of sight passes the axis this far on the side that the columns go to.  radial_mm : its range
+    is too short by this much.  lean_deg, side_deg : the axis is tilted: radial and lateral grow with height above 0.
     """
 
     lateral_mm: float = 0.0
@@ -100,6 +99,7 @@ def _place(
 def _surface_mm(grid: Grid, row: FloatArray, column: FloatArray) -> FloatArray:
     """The true surface's distance from the axis between its samples; -1 where it is void. (n,) [mm]"""
     spec = grid.spec
+    row, column = np.nan_to_num(row, nan=-1.0), np.nan_to_num(column)  # of rays that met nothing
     left, upper = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
     across, down = column - left, row - upper
     corners, weights = [], []

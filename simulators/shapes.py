@@ -15,6 +15,9 @@ SPHERE_RADIUS_MM = 80.0
 SPHERE_MARGIN_MM = 4.0
 CYLINDER_RADIUS_MM = 50.0
 CYLINDER_HEIGHT_MM = 150.0
+POST_RADIUS_MM = 40.0
+POST_OFF_MM = 18.0
+POST_AT_RAD = 0.7
 GRATICULE_RAD = np.pi / 12
 GRATICULE_MM = 10.0
 
@@ -48,6 +51,14 @@ def cylinder(shape: Shape, seed: int) -> Grid:
     """A cylinder round the axis, as high as the scan: no void anywhere."""
     spec = spec_for(shape, 0.0, CYLINDER_HEIGHT_MM)
     return _turned(spec, np.full(spec.height, CYLINDER_RADIUS_MM), seed)
+
+
+def post(shape: Shape, seed: int) -> Grid:
+    """A round cylinder that stands off the axis: what an axis is calibrated with."""
+    spec = spec_for(shape, 0.0, CYLINDER_HEIGHT_MM)
+    ahead = spec.angle_rad(np.arange(spec.width)) - POST_AT_RAD
+    outline_mm = POST_OFF_MM * np.cos(ahead) + np.sqrt(POST_RADIUS_MM**2 - (POST_OFF_MM * np.sin(ahead)) ** 2)
+    return Grid(spec, mm_to_steps(np.tile(outline_mm, (spec.height, 1)), spec.step_mm), _graticule(spec, seed))
 
 
 def _turned(spec: GridSpec, profile_mm: FloatArray, seed: int) -> Grid:

@@ -29,6 +29,7 @@ GENERATORS: Mapping[str, Callable[[shapes.Shape, int], Grid]] = MappingProxyType
     {
         "sphere": shapes.sphere,
         "cylinder": shapes.cylinder,
+        "post": shapes.post,
         "nutcracker": nutcracker,
         "head": head,
         "pebble": pebble,

@@ -4,7 +4,8 @@
                                             processor time, how long the node kept it waiting
     look URL CLIENTS                        clients that look as fast as they can, until SIGTERM; prints their updates
     read ADDRESS BYTES                      the USB driver alone, under umockdev's preload; prints seconds and CPU
-    assemble                                a grid of L from its columns; prints seconds, processor time and memory
+    assemble [LATERAL RADIAL LEAN SIDE]     a grid of L from its columns, corrected for an axis that is there; prints
+                                            seconds, processor time and memory
 """
 
 from __future__ import annotations
@@ -151,10 +152,14 @@ def read(address: str, size_bytes: str) -> None:
         say(seconds=time.monotonic() - began_s, cpu_s=time.process_time() - cpu_s)
 
 
-def assemble() -> None:
-    """A sweep at L whose last column has just come; memory is what it took beyond the program itself."""
+def assemble(*axis: str) -> None:
+    """A sweep at L whose last column has just come; memory is what it took beyond the program itself.
+
+    axis : lateral, radial, lean, side; to be corrected for.
+    """
     from exchange.formats import SIZES
     from node.assemble import Assembler
+    from node.axis import Axis
     from node.resampling import Encoder
     from protocol.grid import GridSpec
 
@@ -172,7 +177,7 @@ def assemble() -> None:
     for column in range(texture_width):
         assembler.add_texture_column(2 * column + 1, 0, np.roll(texels, column, axis=0))
     began_s, began_cpu_s = time.perf_counter(), time.process_time()
-    grid = assembler.assembly().grid
+    grid = assembler.assembly(axis=Axis(*map(float, axis)) if axis else None).grid
     took_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
     arrays = grid.range_steps.nbytes + grid.texture.nbytes
     say(seconds=took_s, cpu_s=cpu_s, arrays_bytes=arrays, peak_bytes=_peak_bytes() - before)
