@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, TypeVar
 
 from client.arguments import add_node, between, chosen_node
-from client.scan_command import sweep_once
+from client.scan_command import record_of, sweep_once
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -40,14 +40,12 @@ def run_calibrate(args: argparse.Namespace) -> int:
     """Print the axis that was found, or those that are known."""
     import asyncio
 
-    from msgspec import to_builtins
-
     from client.axis import forget_axis, known_axes
 
     if args.list:
         axes = asyncio.run(_at_node(args, known_axes))
         for known in axes:
-            print(json.dumps(to_builtins(known)) if args.json else _in_words(known), flush=True)
+            print(json.dumps(record_of(known)) if args.json else _in_words(known), flush=True)
         if not axes and not args.json:
             print("no scanner's axis is known: sweeps are as the scanner measures them", flush=True)
     elif args.forget is not None:
@@ -56,7 +54,7 @@ def run_calibrate(args: argparse.Namespace) -> int:
         print(json.dumps(said) if args.json else f"axis of {printable(args.forget)} forgotten", flush=True)
     else:
         found = asyncio.run(_calibrate(args))
-        print(json.dumps(to_builtins(found)) if args.json else _in_words(found), flush=True)
+        print(json.dumps(record_of(found)) if args.json else _in_words(found), flush=True)
         if not args.json:
             print(f"sweeps of {printable(found.scanner)} are corrected for that from now on", flush=True)
     return 0

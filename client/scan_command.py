@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from client.session import Session
-    from protocol.quality import ScanQuality
+    from protocol.quality import FoundAxis, ScanQuality
 
 POLL_S = 0.2
 AWAY_S = 35.0  # a node goes on by itself with a sweep that was cut for half a minute ...
@@ -32,16 +32,21 @@ def run_scan(args: argparse.Namespace) -> int:
     """Sweep once; print the new scan's id and quality."""
     import asyncio
 
-    from msgspec.structs import asdict
-
     scan, quality = asyncio.run(_scan(args))
     if args.json:
-        print(json.dumps({"scan": scan, "quality": asdict(quality) if quality else None}), flush=True)
+        print(json.dumps({"scan": scan, "quality": record_of(quality) if quality else None}), flush=True)
         return 0
     print(f"scan {printable(scan)}", flush=True)
     for line in _in_words(quality) if quality else ():
         print(line, flush=True)
     return 0
+
+
+def record_of(said: ScanQuality | FoundAxis) -> dict[str, object]:
+    """What a node said, as --json prints it."""
+    from msgspec.structs import asdict
+
+    return {**asdict(said), "axis": asdict(said.axis) if said.axis else None}
 
 
 def _in_words(quality: ScanQuality) -> Iterator[str]:

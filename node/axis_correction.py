@@ -73,7 +73,7 @@ def laid_out(values: Lengths, at: Lengths, *, is_cyclic: bool) -> StepArray:
     out = np.zeros(n * length, np.uint16)
     first = np.ceil(at)
     for ahead in (0, 1):
-        hit = np.flatnonzero(joined & (first + np.float32(ahead) < after_at))
+        hit = np.flatnonzero(joined & (first + np.float32(ahead) <= after_at))
         place = first.ravel()[hit] + np.float32(ahead)
         share = (place - at.ravel()[hit]) / span.ravel()[hit]
         mixed = values.ravel()[hit] + share * (after.ravel()[hit] - values.ravel()[hit])

@@ -49,6 +49,7 @@ _SIGMA_OF_MAD = 1.4826
 _PATCHES_ROUND, _PATCHES_UP = 24, 6
 _PATCH_SAMPLES_MIN = 8
 _UNKNOWNS = 8
+_WIDE = 3.0  # errors that grow by so much are not those of samples
 _LATERAL, _RADIAL, _LEAN, _SIDE = range(4)
 
 
@@ -115,7 +116,8 @@ def estimate(grid: Grid, diameter_mm: float, corrected_by: Axis | None = None) -
             " use a true one, and measure its diameter again"
         )
     covariance = _covariance(fit, widening)
-    _check_sure(covariance, grid.spec.height_mm(np.array([0, grid.spec.height - 1])) - middle_mm, radius_mm)
+    ends_mm = grid.spec.height_mm(np.array([0, grid.spec.height - 1])) - middle_mm
+    _check_sure(covariance, ends_mm, radius_mm, widening)
     lateral, radial, lean, side = fit.unknowns[:4].tolist()
     axis = Axis(lateral, radial, lean, side, middle_mm)
     lateral, radial, lean, side = np.sqrt(np.diag(covariance))[:4].tolist()
@@ -284,7 +286,7 @@ def _covariance(fit: _Fit, widening: float) -> FloatArray:
         raise NotCalibrated("the axis cannot be told from this body: use a higher one, further off centre") from None
 
 
-def _check_sure(covariance: FloatArray, heights_mm: FloatArray, radius_mm: float) -> None:
+def _check_sure(covariance: FloatArray, heights_mm: FloatArray, radius_mm: float, widening: float) -> None:
     """Raises NotCalibrated where the offsets are not known well enough from the lowest row to the highest."""
     squares = []
     for offset, lean in ((_LATERAL, _SIDE), (_RADIAL, _LEAN)):
@@ -292,7 +294,9 @@ def _check_sure(covariance: FloatArray, heights_mm: FloatArray, radius_mm: float
         squares += [np.array([1.0, height_mm]) @ both @ np.array([1.0, height_mm]) for height_mm in heights_mm]
     error_mm = math.sqrt(max(0.0, *(float(square) for square in squares)))
     if not error_mm <= UNSURE_MAX * radius_mm:
+        higher = "use a higher body further off centre, or average several passes"
+        truer = "it is not quite a cylinder of that diameter: use a true one, and measure its diameter again"
         raise NotCalibrated(
-            f"the axis is known to {error_mm:.3f} mm only, at most {UNSURE_MAX * radius_mm:.3f} are taken: use a higher"
-            " body further off centre, or average several passes"
+            f"the axis is known to {error_mm:.3f} mm only, at most {UNSURE_MAX * radius_mm:.3f} are taken:"
+            f" {truer if widening > _WIDE else higher}"
         )
