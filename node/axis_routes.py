@@ -10,28 +10,20 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import asdict
-from typing import Annotated
 
-import msgspec
 from aiohttp import web
-from msgspec import Meta, Struct
 
 from node.audit_routes import SCAN, WHAT
-from node.auth import require
-from node.axes import Axes, KnownAxis
+from node.axes import KnownAxis
 from node.axis_fit import NotCalibrated, estimate
+from node.bodies import AxisWanted
+from node.endpoints import route
 from node.library import Library
 from node.library_routes import explained
+from node.rest import decoded, said
 from protocol.quality import AxisOffset, FoundAxis
 
 AT_ONCE = 1
-
-
-class Wanted(Struct, frozen=True, forbid_unknown_fields=True, rename="camel"):
-    """The sweep that tells an axis, and the diameter of the body in it. [mm]"""
-
-    scan: Annotated[str, Meta(max_length=200)]
-    diameter_mm: Annotated[float, Meta(ge=1, le=2000)]
 
 
 class AxisRoutes:
@@ -39,23 +31,21 @@ class AxisRoutes:
 
     def __init__(self, library: Library) -> None:
         self._library = library
-        self._axes: Axes = library.axes
         self._place = asyncio.Semaphore(AT_ONCE)
 
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
         return [
-            web.get("/v1/axes", self._told),
-            web.post("/v1/axes", self._calibrate),
-            web.delete("/v1/axes/{scanner}", self._forget),
+            route("GET /v1/axes", self._told),
+            route("POST /v1/axes", self._calibrate),
+            route("DELETE /v1/axes/{scanner}", self._forget),
         ]
 
     async def _told(self, request: web.Request) -> web.Response:
-        return _json([_said(known) for known in reversed(self._axes.known())])
+        return said([_as_told(known) for known in reversed(self._library.axes.known())])
 
     async def _calibrate(self, request: web.Request) -> web.Response:
-        require(request, "operate")
-        wanted = _decoded(await request.read())
+        wanted = decoded(await request.read(), AxisWanted)
         if self._place.locked():
             raise web.HTTPServiceUnavailable(text="busy with another calibration: try again later")
         async with self._place:
@@ -65,18 +55,18 @@ class AxisRoutes:
             except NotCalibrated as problem:
                 raise web.HTTPUnprocessableEntity(text=str(problem)) from problem
             with explained():
-                await asyncio.to_thread(self._axes.keep, found)
+                await asyncio.to_thread(self._library.axes.keep, found)
         axis = found.estimate.axis
         request[WHAT] = f"{found.scanner}: {axis.lateral_mm:.3f} mm, {axis.radial_mm:.3f} mm"
-        return _json(_said(found), status=201)
+        return said(_as_told(found), 201)
 
     async def _forget(self, request: web.Request) -> web.Response:
-        require(request, "operate")
         scanner = request.match_info["scanner"]
         with explained():
-            if not await asyncio.to_thread(self._axes.forget, scanner):
-                raise web.HTTPNotFound(text=f"no axis of scanner {scanner[:200]!r} is known")
-        request[WHAT] = scanner[:200]
+            was_known = await asyncio.to_thread(self._library.axes.forget, scanner)
+        if not was_known:
+            raise web.HTTPNotFound(text=f"no axis of scanner {scanner[:200]!r} is known")
+        request[WHAT] = scanner
         return web.Response(status=204)
 
 
@@ -94,21 +84,10 @@ def found_by(library: Library, scan_id: str, diameter_mm: float) -> KnownAxis:
     return KnownAxis(about.scanner, about.settings, estimated, scan_id, diameter_mm, time.time())
 
 
-def _said(known: KnownAxis) -> FoundAxis:
+def _as_told(known: KnownAxis) -> FoundAxis:
     e = known.estimate
     return FoundAxis(
         known.scanner, AxisOffset(**asdict(e.axis)), e.lateral_error_mm, e.radial_error_mm, e.lean_error_rad,
         e.side_error_rad, e.noise_mm, e.uneven_mm, e.off_centre_mm, known.scan, known.diameter_mm,
         known.calibrated_unix_s,
     )  # fmt: skip
-
-
-def _decoded(body: bytes) -> Wanted:
-    try:
-        return msgspec.json.decode(body, type=Wanted)
-    except (msgspec.DecodeError, UnicodeDecodeError) as problem:
-        raise web.HTTPBadRequest(text=f"calibrate: {problem}") from problem
-
-
-def _json(value: object, status: int = 200) -> web.Response:
-    return web.Response(body=msgspec.json.encode(value), content_type="application/json", status=status)

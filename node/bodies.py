@@ -18,6 +18,7 @@ from node.scan_folder import Problem
 from protocol import messages as m
 from protocol import pairing
 from protocol.grid import Geometry
+from protocol.quality import ScanQuality
 
 ScanId = Annotated[str, Meta(pattern="^[0-9a-f]{32}$")]
 UnixTime = Annotated[float, Meta(description="[s since 1970, the node's clock]")]
@@ -94,7 +95,7 @@ class ListedScan(_Body, frozen=True):
 class ScanDetail(m.ScanInfo, frozen=True, kw_only=True):
     """A scan. note : how it was made, where it was not measured so.  made_from : the scans that it was made of."""
 
-    quality: m.ScanQuality | None
+    quality: ScanQuality | None
     note: str
     made_from: tuple[str, ...]
 
@@ -185,6 +186,13 @@ class ListedSweep(_Body, frozen=True):
     height: int
     texture_width: int
     texture_height: int
+
+
+class AxisWanted(_Asked, frozen=True):
+    """The sweep of a round body that tells where the axis is, and the body's diameter. [mm]"""
+
+    scan: m.ShortText
+    diameter_mm: Annotated[float, Meta(ge=1, le=2000)]
 
 
 # Who may come in

@@ -20,6 +20,7 @@ from node import bodies as b
 from node.audit import Entry, Event
 from node.sidecar import Changes, Sidecar
 from protocol import pairing
+from protocol.quality import FoundAxis
 
 Content = Mapping[str, Any]
 """A body: its media type, and the kind of record in it; bytes: what is no JSON."""
@@ -33,6 +34,7 @@ PARAMETERS: Mapping[str, Any] = {
     "range": Annotated[str, Meta(pattern="^(-|[0-9]+([.][0-9]+){7,})$")],
     "texture": Annotated[str, Meta(pattern="^(-|[0-9]+([.][0-9]+){8,})$")],
     "name": str,
+    "scanner": Annotated[str, Meta(min_length=1, max_length=200)],
 }
 """What may stand in a path, by its name there."""
 
@@ -143,6 +145,9 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
             event="sweep exported",
         ),
     )),
+    ("view", "see where its scanners' axes are", (
+        Endpoint("GET", "/v1/axes", "where they are", gives={200: _json(tuple[FoundAxis, ...])}),
+    )),
     ("operate", "sweep; go on with a cut sweep, or drop it", (
         Endpoint("POST", "/v1/sweeps", "sweep", gives={202: _json(b.SweepAsked)}, fails=(409,), event="sweep asked"),
         Endpoint(
@@ -150,6 +155,13 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
             gives={202: _json(b.ListedSweep)}, fails=(409,), event="sweep resumed",
         ),
         Endpoint("DELETE", "/v1/sweeps/{sweep}", "drop one", gives={204: None}, event="sweep deleted"),
+    )),
+    ("operate", "calibrate a scanner's axis; forget it", (
+        Endpoint(
+            "POST", "/v1/axes", "find an axis", takes=_json(b.AxisWanted), gives={201: _json(FoundAxis)},
+            fails=(404, 422, 507), event="axis calibrated",
+        ),
+        Endpoint("DELETE", "/v1/axes/{scanner}", "forget one", gives={204: None}, fails=(507,), event="axis forgotten"),
     )),
     ("operate", "import a scan; derive one from another", (
         Endpoint(

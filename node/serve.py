@@ -286,7 +286,7 @@ class NodeServer:
     async def _scan(self, request: web.Request) -> web.Response:
         scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
         request[SCAN] = scan.id
-        quality = scan.about.quality and told(scan.about.quality)
+        quality = told(scan.about.quality) if scan.about.quality else None
         known = structs.asdict(scan_info(scan))
         return said(ScanDetail(**known, quality=quality, note=scan.about.note, made_from=scan.about.made_from))
 

@@ -30,7 +30,9 @@ from exchange.image import encode_png, read_image
 from node import auth, library_routes, proxy, shared
 from node.attempts import place_of_address
 from node.audit import NODE, begins_a_time, entry, read_trail
-from node.bodies import Derivation, FoveaQuery, NewCode
+from node.axes import FILE as AXES
+from node.axes import Axes
+from node.bodies import AxisWanted, Derivation, FoveaQuery, NewCode
 from node.identity import node_identity
 from node.library import About, Library, survey
 from node.library_folder import MARK_FILE, check_format
@@ -45,6 +47,7 @@ from protocol.lattice import Channel
 from tests.client.scripted_node import Planner, synthetic_grid
 from tests.exchange.grids import vase
 from tests.fuzz.target import Target
+from tests.node.round_bodies import KNOWN
 
 REFUSED = (FoveascanError, web.HTTPException)
 ADDRESSES = (b"usb:1209:5ca1:A7", b"serial:1209:5ca1", b"tcp:[::1]:7400", b"tcp:scanner:7400", b"/dev/ttyACM0")
@@ -63,6 +66,8 @@ def of_disks(folder: Path) -> Iterable[Target]:
     (place / scan / "repairs.npy").write_bytes(_npy(np.array([[1, 2, 3]], np.int32)))
     yield _file("repairs", place / scan / "repairs.npy", lambda: read_grid(place / scan, spec))
     yield _file("library-mark", place / MARK_FILE, lambda: check_format(place))
+    Axes(place).keep(KNOWN)
+    yield _file("axes", place / AXES, lambda: Axes(place))
     node_identity(place)
     yield _file("identity", place / "node-id", lambda: node_identity(place))
     trail = Trail(folder / "audit", "audit", 1 << 20)
@@ -90,6 +95,8 @@ def of_hearsay() -> Iterable[Target]:
     yield Target("envelope", (_deflated(bytes(2 * blocks[0] * blocks[1])),), _EnvelopeOf(planner))
     derivation = msgspec.json.encode({"geometry": "sphere", "caps": True, "top": "latest", "tipDeg": 80})
     yield Target("derivation", (derivation,), lambda data: decoded(data, Derivation), REFUSED)
+    calibration = b'{"scan":"latest","diameterMm":80}'
+    yield Target("calibration", (calibration,), lambda data: decoded(data, AxisWanted), REFUSED)
     yield Target("code", (b'{"name":"x","role":"view"}',), _decode_code, REFUSED)
     yield Target("if-match", (b'"3"',), _asked({"If-Match": ""}, library_routes._revision), REFUSED)
     yield Target("bearer", (b"Bearer abc",), _asked({"Authorization": ""}, auth._token_shown), REFUSED)

@@ -30,11 +30,12 @@ PATHS = (
     "/v1/scans/latest.npz", "/v1/scans/latest/fovea?u=0.5&v=0.5&max_bytes=900",
     "/v1/scans/0/fovea/00000000/2.0.0.1.1.0.0.1/-", "/v1/scans/latest/sidecar", "/v1/scans/latest/verify",
     "/v1/scans/latest/derive", "/v1/sweeps", "/v1/sweeps/0.npz", "/v1/sweeps/0/resume", "/v1/sweeps/0",
+    "/v1/axes", "/v1/axes/0",
 )  # fmt: skip
 BODIES = (
     b'{"name":"x"}', b'{"name":"x","role":"view"}', b"code=ABCD-EFGH-IJKL-MNOP", b"PK\x03\x04",
     b'{"nonce":"' + b"01" * 16 + b'","proof":"' + b"ab" * 32 + b'"}', b'{"geometry":"sphere","caps":true}',
-    b'{"pins":[{"u":0.5,"v":0.5,"label":"x"}],"notes":"y"}',
+    b'{"scan":"latest","diameterMm":80}', b'{"pins":[{"u":0.5,"v":0.5,"label":"x"}],"notes":"y"}',
 )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from tests.waiting import until
 PRIVATE = ("a secret name", "subject-0815")
 NOT_AUDITED = {  # they show, change and delete no scan, or are noted where they are done
     ("GET", "/"), ("GET", "/assets/{name}"), ("GET", "/healthz"), ("GET", "/metrics"), ("GET", "/v1/node"),
-    ("GET", "/openapi.json"),
+    ("GET", "/openapi.json"), ("GET", "/v1/axes"),
     ("GET", "/v1/sweeps"), ("GET", "/v1/audit"), ("GET", "/pair"), ("GET", "/v1/tokens"),
     ("GET", "/v1/stream"),  # node.connection
     ("GET", "/v1/scans/{scan}/fovea"),  # leads to what is audited

@@ -4,15 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from node.axes import FILE, SCANNERS_MAX, Axes, KnownAxis
-from node.axis import Axis
-from node.axis_fit import Estimate
+from node.axes import FILE, SCANNERS_MAX, Axes
 from node.durable import NEW
 from node.library import Library
 from protocol.errors import LibraryError
+from tests.node.round_bodies import KNOWN
 
-FOUND = Estimate(Axis(0.8, -0.5, 0.002, -0.001, 75.0), 0.002, 1e-4, 1e-6, 3e-5, 0.02, 0.0, 18.0, 36000, 1.0)
-KNOWN = KnownAxis("SIM-0001", (1 << 64) - 1, FOUND, "0" * 32, 80.0, 1795314511.7)
+FOUND = KNOWN.estimate
 
 
 def test_what_is_kept_is_there_after_a_restart(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from node.repair import repair, undone
 from protocol.grid import STEPS_MAX, VOID, Grid, GridSpec
 from simulators.off_axis import OffAxis, seen_off_axis
 from simulators.specimen import make_specimen
-from tests.node.bodies import Body, seen_mm, spec_of, swept
+from tests.node.round_bodies import Body, seen_mm, spec_of, swept
 
 OFFSETS = [OffAxis(0.8, -0.5), OffAxis(-1.5, 1.0, 0.3, -0.4)]
 

@@ -9,7 +9,7 @@ from protocol.grid import VOID, Grid, GridSpec
 from simulators.off_axis import OffAxis, parse_off_axis, seen_off_axis
 from simulators.shapes import POST_AT_RAD, POST_OFF_MM, POST_RADIUS_MM
 from simulators.specimen import make_specimen
-from tests.node.bodies import Body, seen_mm
+from tests.node.round_bodies import Body, seen_mm
 
 
 def test_a_sensor_on_the_axis_sees_the_truth() -> None:

@@ -24,6 +24,8 @@ export interface Quality {
   spikes: number;
   filled: number;
   requestedColumns: number;
+  /** Where the scanner's axis is, if the scan was corrected for that. */
+  axis: { lateralMm: number; radialMm: number } | null;
   /** What of this a person should know, in words. */
   complaints: string[];
 }
@@ -54,7 +56,8 @@ export interface Capture {
 
 /** What is left out of a quality stands for. */
 const UNSAID: Quality = {
-  coverage: 0, holes: 0, passes: 1, noiseMm: null, slipDeg: null, spikes: 0, filled: 0, requestedColumns: 0, complaints: [],
+  coverage: 0, holes: 0, passes: 1, noiseMm: null, slipDeg: null, spikes: 0, filled: 0, requestedColumns: 0, axis: null,
+  complaints: [],
 };
 
 /** The node said no; the message is for people. */

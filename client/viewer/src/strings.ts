@@ -191,6 +191,8 @@ export const strings = {
       ['Turns averaged', String(q.passes)],
       ['Spikes taken out, holes filled', `${q.spikes}, ${q.filled}`],
       ['Columns asked for again', String(q.requestedColumns)],
+      ['Scanner’s axis', q.axis === null ? 'taken as the scanner has it'
+        : `corrected by ${q.axis.lateralMm.toFixed(2)} mm sideways, ${q.axis.radialMm.toFixed(2)} mm in range`],
     ],
   },
   role: 'You may look, measure and download here. To sweep, to set pins, to name or delete scans, have this browser paired with the role “operate”.',

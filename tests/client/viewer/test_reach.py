@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.client.viewer.browser import barriers, crop, layout_faults, opened, psnr, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
@@ -117,6 +118,17 @@ def test_what_a_sweep_is_worth_is_said(browser: Browser, node: RunningNode) -> N
         assert measured == f"{100 * truth['coverage']:.1f} % of all points"
         assert panel.get_by_text("Nothing speaks against this scan.").is_visible() == (not truth.get("complaints"))
         assert panel.locator("dt", has_text="Noise").locator("+ dd").text_content() == "unknown: nothing was seen twice"
+        axis = panel.locator("dt", has_text="axis").locator("+ dd")
+        assert axis.text_content() == "taken as the scanner has it"
+
+        def corrected(route: Route) -> None:
+            said = route.fetch().json()
+            said["quality"]["axis"] = {"lateralMm": 0.8, "radialMm": -0.5}
+            route.fulfill(json=said)
+
+        page.route(re.compile("/v1/scans/[0-9a-f]{32}$"), corrected)
+        page.reload()
+        expect(axis).to_have_text("corrected by 0.80 mm sideways, -0.50 mm in range")
 
 
 def dragged(page: Page) -> int:

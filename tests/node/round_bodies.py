@@ -7,10 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from node.axes import KnownAxis
 from node.axis import Axis
+from node.axis_fit import Estimate
 from protocol.grid import FloatArray, Grid, GridSpec, mm_to_steps
 
 TALL_MM = 150.0
+FOUND = Estimate(Axis(0.8, -0.5, 0.002, -0.001, 75.0), 0.002, 1e-4, 1e-6, 3e-5, 0.02, 0.0, 18.0, 36000, 1.0)
+KNOWN = KnownAxis("SIM-0001", (1 << 64) - 1, FOUND, "0" * 32, 80.0, 1795314511.7)
+"""What a node may know of a scanner that saw one."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,8 @@ def seen_mm(axis: Axis, body: Body, spec: GridSpec) -> FloatArray:
     about_x = np.array([[1, 0, 0], [0, math.cos(side), math.sin(side)], [0, -math.sin(side), math.cos(side)]])
     theta = spec.angle_rad(np.arange(spec.width))
     zero = np.zeros_like(theta)
-    turn = np.stack([[np.cos(theta), -np.sin(theta), zero], [np.sin(theta), np.cos(theta), zero], [zero, zero, zero + 1]])
+    cos, sin = np.cos(theta), np.sin(theta)
+    turn = np.stack([[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]])
     to_table = np.einsum("ijw,jk->wik", turn, about_x @ about_y)  # (W, 3, 3)
     heights = spec.height_mm(np.arange(spec.height)) - axis.height_mm
     start = np.stack([np.zeros_like(heights), np.full_like(heights, axis.lateral_mm), heights])  # (3, H), at x = 0
