@@ -147,7 +147,7 @@ def test_listing_reads_no_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(durable, "open", noted_open, raising=False)
     monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("samples were read"))
     assert len(Library(tmp_path).scans()) == 1
-    assert set(opened) == {"library.json", "scan.json", "sidecar.json"}
+    assert set(opened) == {"library.json", "axes.json", "scan.json", "sidecar.json"}
 
 
 @pytest.mark.parametrize("scan_id", ["", "0" * 32, "../library", "x" * 10_000, "\0"])
