@@ -65,12 +65,12 @@ class Part:
 class Coded:
     """Samples of a lattice, encoded: in one part, on a sphere in one for each strip.
 
-    rank, quality, codec : as in protocol.holdings and protocol.refinement.
+    rank, quality, codec : as in protocol.holdings and protocol.refinement; of HTJ2K quality has sixteenths.
     """
 
     parts: tuple[Part, ...]
     rank: int
-    quality: int
+    quality: float
     codec: int
 
     @property
@@ -106,7 +106,7 @@ class Coded:
     def refinement(self, epoch: int, seq: int, look: int) -> Refinement:
         """The wire record."""
         return Refinement(
-            Generator.FOVEA, self.channel, epoch, seq, look, self.codec, self.quality, samples_of(self.strips),
+            Generator.FOVEA, self.channel, epoch, seq, look, self.codec, int(self.quality), samples_of(self.strips),
             self.payload, self.mask, self.parameters,
         )  # fmt: skip
 

@@ -227,7 +227,7 @@ class _Planner:
         texture = None
         if last is not None:
             sample_bytes = len(last.payload) / samples_of(last.strips)
-            texture = TextureParameters(last.parameters.spacing, last.quality, self._codec), sample_bytes
+            texture = TextureParameters(last.parameters.spacing, int(last.quality), self._codec), sample_bytes
         if self._scan.spec.geometry == "sphere":
             self._fill_caps(wanted, texture)
             return

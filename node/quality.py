@@ -12,6 +12,7 @@ from node.texture_model import MSE_MIN, Expected
 MARGIN = 0.98  # of the squared error allowed: what is aimed at
 OVERSHOOT_DB = 0.45  # a result so little above the target is not worth another encode: a step of quality is 0.35 dB
 FILL = 0.88  # of the bytes aimed at: range takes what is left, so only less than this is worth one more encode
+HIGHER = 0.5  # by how much a quality is raised at least that was expected to do and did not
 TRIES = 2  # tries spent on saving or filling bytes; only to reach the target or to fit are there more
 TRIES_MAX = 8
 TRIES_MAX_LIMITED = 3
@@ -39,7 +40,7 @@ class Encodes:
 class Point:
     """One try that fitted: what a quality left and took."""
 
-    quality: int
+    quality: float
     mse: float
     coded: Coded
 
@@ -49,6 +50,7 @@ class QualitySearch:
 
     aim_bytes, limit_bytes : payload to aim at, and the most it may be.
     expected : what qualities take and reach, by the scan's model.  lowest, highest : the codec's qualities.
+    grain : by how much these can differ.
     """
 
     def __init__(
@@ -60,19 +62,20 @@ class QualitySearch:
         lowest: int,
         highest: int,
         tries: int = TRIES,
+        grain: float = 1.0,
     ) -> None:
         self._tries = tries
         self._target = target_mse
         self._aim_bytes, self._limit = aim_bytes, limit_bytes
         self._expected = expected
-        self._lowest, self._highest = lowest, highest
+        self._lowest, self._highest, self._grain = float(lowest), float(highest), grain
         self._points: list[Point] = []
-        self._tried: set[int] = set()
+        self._tried: set[float] = set()
         self.limited = False
-        self._next: int | None = None
+        self._next: float | None = None
         self._aim(1.0, 1.0)
 
-    def next_quality(self) -> int | None:
+    def next_quality(self) -> float | None:
         """What to try now; None when the search is over."""
         most = TRIES_MAX_LIMITED if self.limited and not self._points else TRIES_MAX
         if self._next is None or self._next in self._tried or len(self._tried) >= most:
@@ -99,19 +102,19 @@ class QualitySearch:
         if self._next in self._tried:
             self._next = None if reached or self.limited else self._above(point.quality)
 
-    def at_least(self, quality: int) -> None:
+    def at_least(self, quality: float) -> None:
         """Less than this leaves blocks as they are that spoil the result."""
         if self._next is not None:
             self._lowest = max(self._lowest, min(quality, self._highest))
             self._next = max(self._next, self._lowest)
 
-    def missed_all(self, quality: int, needed: int) -> None:
+    def missed_all(self, quality: float, needed: float) -> None:
         """A try would be adopted nowhere, and what is held is too poor: at least `needed` would be."""
         self._next = max(needed, quality + 1) if max(needed, quality + 1) <= self._highest else None
 
-    def too_large(self, quality: int, payload_bytes: int) -> None:
+    def too_large(self, quality: float, payload_bytes: int) -> None:
         """A try took more than there is; nothing at or above its quality fits."""
-        self._highest = quality - 1
+        self._highest = quality - self._grain
         self.limited = True
         self._aim(1.0, payload_bytes / self._expected.size_bytes(quality))
         if self._highest < self._lowest:
@@ -124,16 +127,28 @@ class QualitySearch:
             return min(reached, key=lambda point: point.coded.wire_bytes)
         return min(self._points, key=lambda point: point.mse, default=None)
 
-    def _above(self, quality: int) -> int:
+    def _above(self, quality: float) -> float:
         """What to try after a quality that is too low: half way to the lowest that is not, where one is known."""
         enough = min((point.quality for point in self._points if point.mse <= self._target), default=None)
-        return min(quality + 1, self._highest) if enough is None else (quality + enough) // 2
+        if enough is None:
+            return min(quality + max(self._grain, HIGHER), self._highest)
+        return floored((quality + enough) / 2, self._grain)
 
     def _aim(self, worse: float, larger: float) -> None:
         """Choose the next quality, given how far the expectation was off: factors on squared error and bytes."""
-        wanted = self._expected.quality_for_mse(MARGIN * self._target / worse)
+        wanted = ceiled(self._expected.quality_for_mse(MARGIN * self._target / worse), self._grain)
         affordable = wanted
         if math.isfinite(self._aim_bytes):
-            affordable = self._expected.quality_for_bytes(self._aim_bytes / larger)
+            affordable = floored(self._expected.quality_for_bytes(self._aim_bytes / larger), self._grain)
         self.limited |= affordable < wanted
         self._next = min(max(min(wanted, affordable), self._lowest), self._highest)
+
+
+def ceiled(quality: float, grain: float) -> float:
+    """The next quality that there is, upward."""
+    return math.ceil(quality / grain) * grain
+
+
+def floored(quality: float, grain: float) -> float:
+    """The same downward."""
+    return math.floor(quality / grain) * grain

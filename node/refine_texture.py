@@ -27,6 +27,7 @@ from protocol.strips import Strips, blocks_of, build_strips, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
+NEVER = 1 << 16  # a quality that there is not
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -67,22 +68,24 @@ def code_texture(
     Raises LatticeError for a spacing that does not fit, CodecError for a quality the codec does not have.
     """
     parameters = texture_lattice(state, region, wanted, merged=merged)
-    return code_texture_lattice(scan, state, parameters, wanted.quality, CODECS[wanted.codec], quick=quick)
+    best, codec = _best_needed(state, parameters, wanted.quality), CODECS[wanted.codec]
+    if best > wanted.quality and codec is TextureCodec.JPEG and best > JPEG_QUALITY_MAX:
+        codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
+    return code_texture_lattice(scan, state, parameters, best, codec, quick=quick)
 
 
 def code_texture_lattice(
-    scan: Scan, state: ClientState, parameters: Parameters, quality: int, codec: TextureCodec, *, quick: bool = False
+    scan: Scan, state: ClientState, parameters: Parameters, quality: float, codec: TextureCodec, *, quick: bool = False
 ) -> Coded | None:
-    """The same for a lattice that is given."""
-    strips, best = _select(state, parameters, quality)
+    """The same for a lattice that is given, at this quality: blocks that are held at a better one stay as they are."""
+    held, rank = state.holdings.channels[Channel.TEXTURE], texture_rank(int(quality))
+    strips = select_strips(build_strips(held.shape, parameters), held, rank)
     if not strips:
         return None
-    if best > quality and codec is TextureCodec.JPEG and best > JPEG_QUALITY_MAX:
-        codec = TextureCodec.HTJ2K  # JPEG ends below what the client holds
     texels = (texture_samples(scan, strip.selection) for strip in strips)
-    payloads = (encode_texture(image, codec, best, quick=quick) for image in texels)
+    payloads = (encode_texture(image, codec, quality, quick=quick) for image in texels)
     parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
-    return Coded(parts, texture_rank(best), best, codec)
+    return Coded(parts, rank, quality, codec)
 
 
 def listed_texture(state: ClientState, region: Region, target_mse: float) -> tuple[int, ...] | None:
@@ -96,14 +99,15 @@ def listed_texture(state: ClientState, region: Region, target_mse: float) -> tup
 
 def select_texture(state: ClientState, region: Region, wanted: TextureParameters) -> tuple[Strips, int]:
     """What code_texture would carry, if anything, and how good."""
-    return _select(state, texture_lattice(state, region, wanted), wanted.quality)
+    held, parameters = state.holdings.channels[Channel.TEXTURE], texture_lattice(state, region, wanted)
+    best = _best_needed(state, parameters, wanted.quality)
+    return select_strips(build_strips(held.shape, parameters), held, texture_rank(best)), best
 
 
-def _select(state: ClientState, parameters: Parameters, quality: int) -> tuple[Strips, int]:
+def _best_needed(state: ClientState, parameters: Parameters, quality: int) -> int:
+    """The quality at which every block that a lattice would make finer is adopted, this one at least."""
     held = state.holdings.channels[Channel.TEXTURE]
-    lattices = build_strips(held.shape, parameters)
-    best = max([quality, *(_best_held(held, lattice) for lattice in lattices)])
-    return select_strips(lattices, held, texture_rank(best)), best
+    return max([quality, *(_best_held(held, lattice) for lattice in build_strips(held.shape, parameters))])
 
 
 def texture_lattice(
@@ -142,7 +146,7 @@ def measured(coded: Coded) -> Coded:
 
 
 def _measured(part: Part, coded: Coded) -> Part:
-    texels = decode_texture(part.payload, TextureCodec(coded.codec), coded.quality, part.selection.sample_shape)
+    texels = decode_texture(part.payload, TextureCodec(coded.codec), int(coded.quality), part.selection.sample_shape)
     return replace(part, patch=texture_patch(part.selection, texels))
 
 
@@ -215,11 +219,23 @@ def held_error(
     return float(inside @ mse), int(inside.sum())
 
 
-def quality_to_mend(state: ClientState, kept: BoolArray, region: Region, target_mse: float) -> int:
-    """The quality at which the too poor of the blocks that are kept would be sent again; 0: none is."""
+def quality_needed(state: ClientState, region: Region, p: float) -> IntArray:
+    """The lowest quality at which a spacing would be adopted in each of a region's blocks (F-09c).
+
+    NEVER where it would not be, since they are held finer. (rows, columns) of Region.blocks.
+    """
     held, place = state.holdings.channels[Channel.TEXTURE], _place(state.missed.shape, region)
-    poor = kept & (state.missed[place] > target_mse)
-    return int(held.rank[place][poor].max(initial=0)) - 1 + RANK_MARGIN[Channel.TEXTURE] if poor.any() else 0
+    level, sent = held.level[place].astype(np.int64), math.ceil(2 * math.log2(p))
+    quality = held.rank[place].astype(np.int64) - 1
+    same = np.where(level == sent, quality + RANK_MARGIN[Channel.TEXTURE], quality)
+    return np.where(level < sent, NEVER, same)
+
+
+def quality_to_mend(state: ClientState, kept: BoolArray, region: Region, p: float, target_mse: float) -> int:
+    """The quality at which the too poor of the blocks that are kept would be sent again at a spacing; 0: none is."""
+    poor = kept & (state.missed[_place(state.missed.shape, region)] > target_mse)
+    needed = quality_needed(state, region, p)[poor]
+    return int(needed[needed < NEVER].max(initial=0))
 
 
 def _place(blocks: tuple[int, ...], region: Region) -> tuple[IntArray, IntArray]:

@@ -10,7 +10,7 @@ cache reads. Browsers and whatever else is in between are told to keep nothing.
 
     /v1/scans/{scan}/fovea/{epoch}/{range}/{texture}
     range    spacing.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quantum        or -
-    texture  spacing.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.quality.codec  or -
+    texture  spacing.block_x.block_y.blocks_wide.blocks_high.rho_x.rho_y.sixteenths.codec  or -
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from node.refine_range import code_range_lattice
 from node.refine_texture import code_texture_lattice
 from node.rest import query_of
 from protocol import messages as m
-from protocol.codec import TextureCodec
+from protocol.codec import SIXTEENTHS, TextureCodec
 from protocol.errors import CodecError, LatticeError, LibraryError
 from protocol.lattice import Channel, Parameters
 from protocol.refinement import from_spacing_byte, spacing_byte
@@ -174,9 +174,12 @@ def canonical_path(scan_id: str, epoch: str, coded: tuple[Coded, ...]) -> str:
     parts = {"range": NONE, "texture": NONE}
     for one in coded:
         p = one.parameters
-        numbers = [spacing_byte(p), p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y, one.quality]
-        codec = [] if one.channel is Channel.RANGE else [int(one.codec)]
-        parts[one.channel.name.lower()] = ".".join(map(str, [*numbers, *codec, *(p.listed or ())]))
+        numbers = [spacing_byte(p), p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y]
+        if one.channel is Channel.RANGE:
+            numbers.append(int(one.quality))
+        else:
+            numbers += [round(one.quality * SIXTEENTHS), int(one.codec)]
+        parts[one.channel.name.lower()] = ".".join(map(str, [*numbers, *(p.listed or ())]))
     return f"/v1/scans/{scan_id}/fovea/{epoch}/{parts['range']}/{parts['texture']}"
 
 
@@ -194,8 +197,9 @@ def _encode(scan: Scan, view: FirstView, range_part: str, texture_part: str) -> 
         lattice, (quantum,), listed = _numbers(range_part, RANGE_NUMBERS)
         coded.append(code_range_lattice(scan, view.state, _parameters(*lattice, listed=listed), quantum))
     if texture_part != NONE:
-        lattice, (quality, codec), listed = _numbers(texture_part, TEXTURE_NUMBERS)
+        lattice, (sixteenths, codec), listed = _numbers(texture_part, TEXTURE_NUMBERS)
         parameters = _parameters(*lattice, listed=listed)
+        quality = sixteenths / SIXTEENTHS
         coded.append(code_texture_lattice(scan, view.state, parameters, quality, TextureCodec(codec)))
     return body_of(tuple(one for one in coded if one is not None))
 

@@ -77,22 +77,22 @@ class Expected:
         steps = np.array(qualities, np.float64) - FIRST_QUALITY
         return cls(qualities, np.log(target_mse) - LOG_MSE_SLOPE * steps, np.log(size_bytes) + LOG_BYTES_SLOPE * steps)
 
-    def quality_for_mse(self, mse: float) -> int:
+    def quality_for_mse(self, mse: float) -> float:
         """The lowest quality that should leave no more than this error."""
         falling = np.minimum.accumulate(self.log_mse)
         wanted = np.log(max(mse, MSE_LEAST))
         slope = self._last_slope(falling)
         beyond = min((wanted - falling[-1]) / slope, LOSSLESS) if slope < 0 and wanted < falling[-1] else 0
-        return int(np.ceil(np.interp(-wanted, -falling, self.qualities) + beyond))
+        return float(np.interp(-wanted, -falling, self.qualities) + beyond)
 
-    def quality_for_bytes(self, size_bytes: float) -> int:
+    def quality_for_bytes(self, size_bytes: float) -> float:
         """The highest quality that should take no more than this; -1 where none does."""
         rising = np.maximum.accumulate(self.log_bytes)
         wanted = np.log(max(size_bytes, 1.0))
         slope, first = self._last_slope(rising), self._first_slope(rising)
         beyond = max(wanted - rising[-1], 0) / slope if slope > 0 else 0
         below = max(rising[0] - wanted, 0) / first if first > 0 else LOSSLESS * float(wanted < rising[0])
-        return max(int(np.floor(np.interp(wanted, rising, self.qualities) + beyond - below)), -1)
+        return max(float(np.interp(wanted, rising, self.qualities) + beyond - below), -1.0)
 
     def _at(self, quality: float, values: FloatArray) -> float:
         """Linear interpolation, the first and the last slope kept beyond."""

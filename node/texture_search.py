@@ -14,7 +14,7 @@ from functools import cached_property
 
 from node.coded import Coded, framed, message_overhead, widest_strips
 from node.library import Scan
-from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch
+from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
     CODECS,
     adopted_error,
@@ -26,20 +26,25 @@ from node.refine_texture import (
     measured,
     mse_of_db,
     quality_bounds,
+    quality_needed,
     quality_to_mend,
     texture_lattice,
 )
 from node.state import ClientState
 from node.texture_model import SPACINGS, Expected, TextureModel
+from protocol.codec import SIXTEENTHS
 from protocol.grid import TEXTURE_BLOCK, BoolArray
 from protocol.lattice import Channel, Parameters, runs_to_mask
 from protocol.messages import CodecName, Look, TextureParameters
 from protocol.region import Region
 
 SKIRT_S = 1.0
+GRAINS = {"htj2k": 1 / SIXTEENTHS, "jpeg": 1.0}  # by how much qualities of a codec can differ
 WHOLE_SHARE = 0.7  # of what a whole window takes: where a part takes more, the whole is tried too
 HELD_MARGIN = 0.95  # what is held is known block by block, not texel by texel
 FINEST_SHARE = 1.03  # of what another spacing takes: up to there spacing 1 is preferred
+POOR = (1, 2, 4, 16)  # times the error allowed: blocks that are held no better may be sent again
+SPOILT_SHARE = 0.6  # of the error allowed: blocks that stay may take so much of what those that are sent may have
 GENERIC_BYTES_PER_TEXEL = 0.04
 NO_TEXTURE = 16.0  # how much larger than wanted an error is left where no texture is sent, until it is known
 OVERHEAD_BYTES = framed(message_overhead(Parameters(2, 0, 0, 1, 1)))
@@ -80,6 +85,7 @@ class TextureSearch:
         self._target_mse = mse_of_db(look.texture_db)
         self._stride_max = widest_strips(state.shapes[Channel.TEXTURE], region)
         self._lowest, self._highest = quality_bounds(codec)
+        self._grain = GRAINS[codec]
         self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
         self.limited = False
         self.mse: float | None = None
@@ -102,7 +108,7 @@ class TextureSearch:
         if self._held_mse <= HELD_MARGIN * self._target_mse:
             self.mse = self._held_mse
             return None
-        listed = listed_texture(self._state, self._region, self._target_mse)
+        listed = self._listing(aim_bytes)
         found = self._search_spacings(aim_bytes, limit_bytes, listed)
         if listed is None or found is None or found.wire_bytes < WHOLE_SHARE * self._expected_whole_bytes():
             return found
@@ -112,6 +118,22 @@ class TextureSearch:
             return whole
         self.mse = reached
         return found
+
+    def _listing(self, aim_bytes: float) -> tuple[int, ...] | None:
+        """Which blocks to send: those that are not good enough, or fewer and these better, or all (None)."""
+        poor = (listed_texture(self._state, self._region, worse * self._target_mse) for worse in POOR)
+        listings = {listed for listed in poor if listed is not None}
+        if not listings or self._model is None:
+            return next(iter(listings), None)
+        offers = {listed: self._choose(aim_bytes - OVERHEAD_BYTES, listed) for listed in (*listings, None)}
+
+        def cost(listed: tuple[int, ...] | None) -> tuple[bool, float]:
+            offer = offers[listed]
+            if offer is None:
+                return True, math.inf
+            return not offer.reaches, offer.size_bytes if offer.reaches else offer.mse
+
+        return min(offers, key=cost)
 
     def skirt(self, p: float) -> float:
         """S' of the skirt: as the viewer's alpha says, else thin."""
@@ -128,11 +150,18 @@ class TextureSearch:
     def _expect(self, p: int, listed: tuple[int, ...] | None) -> Expected:
         if self._model is None:
             return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
-        if listed is None:
-            return self._model.expect(self._region, CODECS[self._codec], p, None, self._stride_max)
-        among = self._blocks(listed)
-        kept_error, kept = self._held_error(~among & self._region.touched(TEXTURE_BLOCK))
+        touched = self._region.touched(TEXTURE_BLOCK)
+        among = touched if listed is None else self._blocks(listed)
         expected = self._model.expect(self._region, CODECS[self._codec], p, among, self._stride_max)
+        needed = quality_needed(self._state, self._region, p)
+        adopted = among & (needed <= expected.quality_for_mse(MARGIN * self._target_mse))
+        if not adopted.any():
+            adopted = among
+        if adopted.sum() < among.sum():
+            expected = self._model.expect(self._region, CODECS[self._codec], p, adopted, self._stride_max)
+        if adopted.sum() == touched.sum():
+            return expected
+        kept_error, kept = self._held_error(~adopted & touched)
         return expected.beside(1 - kept / max(3 * self._region.area, kept), kept_error / max(kept, 1))
 
     def _blocks(self, listed: tuple[int, ...]) -> BoolArray:
@@ -165,10 +194,10 @@ class TextureSearch:
     def _offer(self, p: int, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
         """What a spacing can do for so many bytes of payload; None where it fits at no quality."""
         expected = self._expected(p, listed)
-        wanted = max(expected.quality_for_mse(MARGIN * self._target_mse), self._lowest)
+        wanted = max(ceiled(expected.quality_for_mse(MARGIN * self._target_mse), self._grain), self._lowest)
         quality = min(wanted, self._highest)
         if math.isfinite(aim_bytes):
-            quality = min(quality, expected.quality_for_bytes(aim_bytes))
+            quality = min(quality, floored(expected.quality_for_bytes(aim_bytes), self._grain))
         if quality < self._lowest:
             return None
         return _Choice(p, expected.mse(quality), expected.size_bytes(quality), quality == wanted)
@@ -184,7 +213,7 @@ class TextureSearch:
         best: Point | None = None
         while p in SPACINGS:
             bounds = aim_bytes - OVERHEAD_BYTES, limit_bytes - OVERHEAD_BYTES, self._expected(p, listed)
-            search = QualitySearch(self._target_mse, *bounds, self._lowest, self._highest, self._tries)
+            search = QualitySearch(self._target_mse, *bounds, self._lowest, self._highest, self._tries, self._grain)
             if not self._try_qualities(search, p, listed):
                 return None
             self.limited |= search.limited
@@ -208,22 +237,22 @@ class TextureSearch:
             if coded is None:
                 if self._error(None) <= self._target_mse:
                     return False
-                search.missed_all(quality, self._mending_quality(None))
+                search.missed_all(quality, self._mending_quality(p, None))
                 continue
             if search.fits(coded):
                 coded = measured(coded)
                 mse = self._error(coded)
                 search.measured(Point(quality, mse, coded))
-                if mse > self._target_mse:
-                    search.at_least(self._mending_quality(coded))
+                if mse > self._target_mse and self._spoilt(coded):
+                    search.at_least(self._mending_quality(p, coded))
             else:
                 search.too_large(quality, len(coded.payload))
             self._learn(p, coded)
         return True
 
-    def _code(self, p: int, quality: int, listed: tuple[int, ...] | None) -> Coded | None:
+    def _code(self, p: int, quality: float, listed: tuple[int, ...] | None) -> Coded | None:
         self._encodes.add()
-        wanted = TextureParameters(p, quality, self._codec, self.skirt(p))
+        wanted = TextureParameters(p, int(quality), self._codec, self.skirt(p))
         parameters = texture_lattice(self._state, self._region, wanted)
         if listed is not None:
             parameters = replace(parameters, listed=listed)
@@ -231,9 +260,16 @@ class TextureSearch:
             self._scan, self._state, parameters, quality, CODECS[self._codec], quick=self._quick
         )
 
-    def _mending_quality(self, coded: Coded | None) -> int:
+    def _spoilt(self, coded: Coded) -> bool:
+        """Whether blocks that a refinement leaves as they are have so much of the error allowed that it is worth more
+        to send them too than to send the others better."""
+        kept_error, kept = self._held_error(left_alone(self._state, coded, self._region))
+        sent = max(3 * self._region.area - kept, 0)
+        return kept_error > self._target_mse * (kept + sent * SPOILT_SHARE)
+
+    def _mending_quality(self, p: int, coded: Coded | None) -> int:
         kept = left_alone(self._state, coded, self._region)
-        return quality_to_mend(self._state, kept, self._region, self._target_mse)
+        return quality_to_mend(self._state, kept, self._region, p, self._target_mse)
 
     def _error(self, coded: Coded | None) -> float:
         """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""

@@ -14,12 +14,13 @@ from enum import IntEnum
 
 import numpy as np
 
-from protocol import codec_htj2k, codec_jpeg, codec_lift, codec_mask
+from protocol import codec_colours, codec_htj2k, codec_jpeg, codec_lift, codec_mask
 from protocol.errors import CodecError
 from protocol.grid import BoolArray, ImageArray, StepArray, dequantise, quantise
 
 LOSSLESS = codec_htj2k.LOSSLESS
 LOSSY_MAX = codec_htj2k.LOSSY_MAX
+SIXTEENTHS = codec_colours.SIXTEENTHS  # of a step of quality: as fine is a lossy HTJ2K's
 SAMPLES_MAX = 1 << 25
 SIDE_MAX = 16384
 
@@ -49,25 +50,27 @@ JPEG_Q = (
 JPEG_QUALITY_MAX = JPEG_QUALITY_MIN + len(JPEG_Q) - 1
 
 
-def encode_texture(image: ImageArray, codec: TextureCodec, quality: int, *, quick: bool = False) -> bytes:
+def encode_texture(image: ImageArray, codec: TextureCodec, quality: float, *, quick: bool = False) -> bytes:
     """Payload of an (h, w, 3) uint8 RGB image.
 
-    quality : 0..LOSSY_MAX or LOSSLESS for HTJ2K, JPEG_QUALITY_MIN..JPEG_QUALITY_MAX for JPEG.
+    quality : 0..LOSSY_MAX in sixteenths or LOSSLESS for HTJ2K, JPEG_QUALITY_MIN..JPEG_QUALITY_MAX for JPEG.
     quick : half the time and 5 to 30% more bytes for JPEG, where the link is fast; nothing else differs.
     Raises CodecError for any other quality and for an array that is no such image.
     """
     _check_array(image, np.uint8, 3)
     if codec == TextureCodec.JPEG:
         return codec_jpeg.encode(image, jpeg_q(quality), quick)
-    return codec_htj2k.encode(image, quality)
+    return codec_htj2k.encode(image, LOSSLESS) if quality == LOSSLESS else codec_colours.encode(image, quality)
 
 
 def decode_texture(payload: bytes, codec: TextureCodec, quality: int, shape: tuple[int, int]) -> ImageArray:
-    """(h, w, 3) uint8 RGB of a payload, shape = (h, w). Raises CodecError."""
+    """(h, w, 3) uint8 RGB of a payload, shape = (h, w), quality its whole steps. Raises CodecError."""
     _check_payload(payload, shape, 3)
     if codec == TextureCodec.JPEG:
         return codec_jpeg.decode(payload, shape, jpeg_q(quality))
-    return codec_htj2k.decode(payload, (*shape, 3), quality)
+    if quality == LOSSLESS:
+        return codec_htj2k.decode(payload, (*shape, 3), LOSSLESS)
+    return codec_colours.decode(payload, shape, quality)
 
 
 def encode_range(
@@ -110,11 +113,11 @@ def decode_mask(payload: bytes, shape: tuple[int, int]) -> BoolArray:
     return codec_mask.decode(payload, shape)
 
 
-def jpeg_q(quality: int) -> int:
-    """Q 10..95 of the JPEG that stands for a quality. Raises CodecError outside JPEG_QUALITY_MIN..JPEG_QUALITY_MAX."""
-    if not JPEG_QUALITY_MIN <= quality <= JPEG_QUALITY_MAX:
+def jpeg_q(quality: float) -> int:
+    """Q 10..95 of the JPEG that stands for a quality. Raises CodecError for other than whole ones of its bounds."""
+    if not JPEG_QUALITY_MIN <= quality <= JPEG_QUALITY_MAX or quality != int(quality):
         raise CodecError(f"JPEG quality must be {JPEG_QUALITY_MIN}..{JPEG_QUALITY_MAX}, got {quality}")
-    return JPEG_Q[quality - JPEG_QUALITY_MIN]
+    return JPEG_Q[int(quality) - JPEG_QUALITY_MIN]
 
 
 def _check_array(array: np.ndarray, dtype: type[np.generic], channels: int) -> None:

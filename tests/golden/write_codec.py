@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol import codec, codec_htj2k, codec_jpeg
+from protocol import codec, codec_colours, codec_htj2k, codec_jpeg
 from protocol.codec import RangeCodec, TextureCodec
 from protocol.grid import BoolArray, ImageArray, StepArray
 
@@ -27,7 +27,7 @@ TEXTURES = (
     ("jpeg_annex_k", TextureCodec.JPEG, 40, (1, 1)),
     ("jpeg_fitted", TextureCodec.JPEG, 46, (64, 48)),
     ("htj2k_one_texel", TextureCodec.HTJ2K, 40, (1, 1)),
-    ("htj2k_coarse", TextureCodec.HTJ2K, 36, (33, 40)),
+    ("htj2k_coarse", TextureCodec.HTJ2K, 36.6875, (33, 40)),
     ("htj2k_fine", TextureCodec.HTJ2K, 61, (64, 72)),
     ("htj2k_black_and_white", TextureCodec.HTJ2K, 40, (40, 48)),
     ("htj2k_lossless", TextureCodec.HTJ2K, codec.LOSSLESS, (16, 48)),
@@ -60,7 +60,7 @@ def main() -> None:
 
 def header_hashes() -> dict[str, str]:
     """SHA-256 of all headers in a row: HTJ2K by side, then quality; JPEG by Q 1..100 at 3 rows of 5."""
-    qualities = (*range(codec.LOSSY_MAX + 1), codec.LOSSLESS)
+    qualities = (*np.arange(0, codec.LOSSY_MAX + 1 / 16, 1 / 16).tolist(), codec.LOSSLESS)
     return {
         "htj2k_texture": _sha256(
             *(codec_htj2k.main_header((side, side, 3), quality) for side in HEADER_SIDES for quality in qualities)
@@ -72,13 +72,16 @@ def header_hashes() -> dict[str, str]:
 
 def _texture_vectors() -> Iterator[dict[str, Any]]:
     for name, kind, quality, shape in TEXTURES:
-        payload = codec.encode_texture(_bars(shape) if name.endswith("white") else _texture(shape), kind, quality)
-        image = codec.decode_texture(payload, kind, quality, shape)
+        source, whole = _bars(shape) if name.endswith("white") else _texture(shape), int(quality)
+        payload = codec.encode_texture(source, kind, quality)
+        image = codec.decode_texture(payload, kind, whole, shape)
         if kind == TextureCodec.JPEG:
-            stream = codec_jpeg.restore(payload, shape, codec.jpeg_q(quality))
+            stream = codec_jpeg.restore(payload, shape, codec.jpeg_q(whole))
+        elif quality == codec.LOSSLESS:
+            stream = codec_htj2k.restore(payload, (*shape, 3), whole)
         else:
-            stream = codec_htj2k.restore(payload, (*shape, 3), quality)
-        yield _write(name, "texture", payload, image, codec=int(kind), quality=quality, stream_sha256=_sha256(stream))
+            stream = codec_colours.restore(payload, shape, whole)
+        yield _write(name, "texture", payload, image, codec=int(kind), quality=whole, stream_sha256=_sha256(stream))
 
 
 def _range_vectors() -> Iterator[dict[str, Any]]:

@@ -156,7 +156,7 @@ def test_more_bytes_never_make_it_worse(scan: Scan, view: FirstView, model_of_te
         reached.append((viewer.texture_db(look), -viewer.range_error_mm(look)))
     for worse, better in zip(reached, reached[1:], strict=False):
         assert better[0] >= worse[0] - 0.5
-        assert better[1] >= worse[1] - 0.03  # texture may take a fifth of the bytes meant for range
+        assert better[1] >= worse[1] - 0.06  # texture may take a fifth of the bytes meant for range
 
 
 @pytest.mark.parametrize("codec", ["htj2k", "jpeg"])

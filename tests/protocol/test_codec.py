@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from protocol import codec, codec_htj2k, codec_jpeg, codec_lift
+from protocol import codec, codec_colours, codec_htj2k, codec_jpeg, codec_lift
 from protocol.codec import RangeCodec, TextureCodec
 from protocol.errors import CodecError
 from protocol.grid import BoolArray, ImageArray, StepArray
@@ -163,9 +163,10 @@ def test_a_mask_never_takes_more_than_its_bits() -> None:
 
 @pytest.mark.parametrize("side", [1, 5, 8, 16, 33, 64, 129, 256, 520])
 def test_openjph_writes_the_headers_that_are_rebuilt(side: int) -> None:
-    image, values = np.zeros((side, side + 3, 3), np.uint8), np.zeros((side + 3, side), np.uint16)
-    for quality in (*range(codec.LOSSY_MAX + 1), codec.LOSSLESS):
-        codec_htj2k.encode(image, quality)
+    image, values = np.zeros((side, side + 3, 3), np.uint16), np.zeros((side + 3, side), np.uint16)
+    for quality in range(0, 16 * codec.LOSSY_MAX + 1, 1 if side <= 16 else 7):
+        codec_htj2k.encode(image, quality / 16)
+    codec_htj2k.encode(image.astype(np.uint8), codec.LOSSLESS)
     codec_htj2k.encode(values, codec.LOSSLESS)
 
 
@@ -190,8 +191,11 @@ def test_rebuilt_streams_are_ordinary_files() -> None:
     jpeg = codec_jpeg.restore(codec_jpeg.encode(image, 75), (40, 56), 75)
     by_opencv = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
     assert by_opencv is not None and cv2.PSNR(image, by_opencv) > 35
-    j2k = codec_htj2k.restore(codec_htj2k.encode(image, 60), image.shape, 60)
-    assert cv2.PSNR(image, imagecodecs.htj2k_decode(j2k)) > 45
+    j2k = codec_htj2k.restore(codec_htj2k.encode(image, codec.LOSSLESS), image.shape, codec.LOSSLESS)
+    np.testing.assert_array_equal(imagecodecs.htj2k_decode(j2k), image)
+    values = image.astype(np.uint16) * codec_htj2k.LEVEL
+    lossy = imagecodecs.htj2k_decode(codec_htj2k.restore(codec_htj2k.encode(values, 60.5), image.shape, 60.5))
+    assert cv2.PSNR(image, (lossy / codec_htj2k.LEVEL).round().astype(np.uint8)) > 45
 
 
 def test_small_jpegs_do_without_fitted_tables_and_large_ones_carry_them() -> None:
@@ -204,6 +208,45 @@ def test_a_quick_jpeg_is_larger_and_the_same_image() -> None:
     assert len(small) < len(quick) and not quick.startswith(b"\xff\xc4")
     first, second = (codec.decode_texture(payload, TextureCodec.JPEG, 40, (130, 200)) for payload in (small, quick))
     np.testing.assert_array_equal(first, second)
+
+
+# --- turned colours
+
+
+def test_colours_of_one_hue_take_less_than_grey_and_two_differences() -> None:
+    y, x = np.mgrid[:96, :128]
+    waves = (np.sin(x / 3) * np.cos(y / 5))[..., None] * (90, 20, -60)
+    image = np.clip(128 + waves, 0, 255).astype(np.uint8)
+    turned = codec_colours.encode(image, 40)
+    usual = codec_htj2k.encode(image.astype(np.uint16) * codec_htj2k.LEVEL, 40)
+    assert cv2.PSNR(image, codec_colours.decode(turned, (96, 128), 40)) > 40
+    assert len(turned) < 0.8 * len(usual)
+
+
+@settings(max_examples=60, deadline=None)
+@given(shapes.flatmap(lambda shape: arrays(np.uint8, (*shape, 3))))
+def test_any_texture_returns_nearly_at_the_best_quality(image: ImageArray) -> None:
+    payload = codec.encode_texture(image, TextureCodec.HTJ2K, 80)
+    decoded = codec.decode_texture(payload, TextureCodec.HTJ2K, 80, image.shape[:2])
+    assert np.abs(decoded.astype(int) - image).max() <= 1
+
+
+def test_a_quality_between_two_whole_ones_lies_between_them() -> None:
+    image = texture((64, 96))
+    image[::5] //= 2
+    payloads = [codec.encode_texture(image, TextureCodec.HTJ2K, 40 + part / 4) for part in range(5)]
+    db = [
+        cv2.PSNR(image, codec.decode_texture(payload, TextureCodec.HTJ2K, 40 + part // 4, (64, 96)))
+        for part, payload in enumerate(payloads)
+    ]
+    assert sorted(db) == db and sorted(payloads, key=len) == payloads
+
+
+@pytest.mark.parametrize("prefix", [b"\x10\x7f\0\0\0", b"\xff\x7f\0\0\0", b"\0\0\0\0\0"])
+def test_more_than_sixteenths_and_no_turn_are_refused(prefix: bytes) -> None:
+    payload = codec.encode_texture(texture((33, 40)), TextureCodec.HTJ2K, 45)
+    with pytest.raises(CodecError, match="sixteenths"):
+        codec.decode_texture(prefix + payload[5:], TextureCodec.HTJ2K, 45, (33, 40))
 
 
 # --- golden vectors
@@ -247,6 +290,10 @@ DECODERS: dict[str, tuple[bytes, Decoder]] = {
     "htj2k": (
         codec.encode_texture(texture((33, 40)), TextureCodec.HTJ2K, 45),
         lambda payload, shape: codec.decode_texture(payload, TextureCodec.HTJ2K, 45, shape),
+    ),
+    "lossless": (
+        codec.encode_texture(texture((33, 40)), TextureCodec.HTJ2K, codec.LOSSLESS),
+        lambda payload, shape: codec.decode_texture(payload, TextureCodec.HTJ2K, codec.LOSSLESS, shape),
     ),
     "range": (
         codec.encode_range(ranges((33, 40)), RangeCodec.HTJ2K),
@@ -366,7 +413,7 @@ def test_qualities_that_no_codec_has_are_refused(quality: int) -> None:
         with pytest.raises(CodecError, match="quality"):
             codec.encode_texture(texture((8, 8)), kind, quality)
         with pytest.raises(CodecError, match="quality"):
-            codec.decode_texture(b"\xff\xd9", kind, quality, (8, 8))
+            codec.decode_texture(b"\0\x7f\0\0\0\xff\xd9", kind, quality, (8, 8))
 
 
 def test_jpeg_has_a_q_for_its_qualities_only() -> None:

@@ -2,6 +2,7 @@ import assert from 'node:assert/strict';
 import { readFile } from 'node:fs/promises';
 import { test } from 'node:test';
 import { Codecs } from '../src/protocol/codec.ts';
+import { restoreColours } from '../src/protocol/codec_colours.ts';
 import { Htj2kDecoder, LOSSLESS, mainHeader, restoreHtj2k } from '../src/protocol/codec_htj2k.ts';
 import { frameHeader, jpegQ, restoreJpeg } from '../src/protocol/codec_jpeg.ts';
 import { RemoteWireError } from '../src/protocol/errors.ts';
@@ -20,7 +21,7 @@ const vectors = (channel: string): any[] => golden.vectors.filter((vector: any) 
 const payloadOf = (vector: any) => bytes(`codec/${vector.name}.payload`);
 
 test('every header that there is, is rebuilt byte for byte', () => {
-  const qualities = [...Array(96).keys(), LOSSLESS];
+  const qualities = [...Array.from({ length: 95 * 16 + 1 }, (_, step) => step / 16), LOSSLESS];
   const texture = SIDES.flatMap((side) => qualities.flatMap((q) => mainHeader({ height: side, width: side, components: 3 }, q)));
   assert.equal(sha256(texture), golden.headers.htj2k_texture);
   const range = SIDES.flatMap((side) => mainHeader({ height: side, width: side, components: 1 }, LOSSLESS));
@@ -34,7 +35,9 @@ test('texture payloads become the whole streams they stand for', () => {
     const [height, width] = vector.shape;
     const stream = vector.codec === JPEG
       ? restoreJpeg(payloadOf(vector), height, width, jpegQ(vector.quality))
-      : restoreHtj2k(payloadOf(vector), { height, width, components: 3 }, vector.quality);
+      : (vector.quality === LOSSLESS ? restoreHtj2k : restoreColours)(
+        payloadOf(vector), { height, width, components: 3 }, vector.quality,
+      );
     assert.equal(sha256(stream), vector.stream_sha256, vector.name);
   }
 });

@@ -14,9 +14,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol import codec_htj2k
 from tests.bench.cache import Cache
-from tests.bench.rivals import jpip, range_tiles
+from tests.bench.rivals import htj2k_texture, jpip, range_tiles
 from tests.bench.rivals.codestream import CodeStream, Layout
 from tests.bench.rivals.jpeg_texture import CHROMA, Q_MAX, Q_MIN, data_bytes, decode_stack, encode_stack, least
 from tests.bench.rivals.offer import PIECE_BYTES, REPLY_BYTES, Unreachable, void_mask
@@ -211,9 +210,8 @@ def _jpeg(chroma: str, tiles: Images, q: int) -> tuple[Images, int]:
 
 
 def _htj2k(tiles: Images, quality: int) -> tuple[Images, int]:
-    payloads = [codec_htj2k.encode(np.ascontiguousarray(tile), quality) for tile in tiles]
-    decoded = [codec_htj2k.decode(data, tile.shape, quality) for data, tile in zip(payloads, tiles, strict=True)]
-    return decoded, sum(len(data) + PIECE_BYTES for data in payloads)
+    coded = [htj2k_texture.code(tile, quality) for tile in tiles]
+    return [decoded for decoded, _ in coded], sum(size for _, size in coded)
 
 
 def _range_coder(codec: str, quanta: list[int], tiles: Images, setting: int) -> tuple[Images, int]:

@@ -17,6 +17,7 @@ from tests.bench.target import Window
 
 QUALITY_MIN, QUALITY_MAX = 16, 72
 SEARCH_TILE = 128
+MIDDLE = 1 << 15
 
 
 def texture_offer(scan: BenchScan, window: Window) -> Offer:
@@ -60,7 +61,15 @@ def _coded(image: np.ndarray, tile: int, quality: int) -> tuple[ImageArray, int]
     for top in range(0, image.shape[0], tile):
         for left in range(0, image.shape[1], tile):
             piece = np.ascontiguousarray(image[top : top + tile, left : left + tile])
-            payload = codec_htj2k.encode(piece, quality)
-            made[top : top + tile, left : left + tile] = codec_htj2k.decode(payload, piece.shape, quality)
-            size += len(payload) + PIECE_BYTES
+            made[top : top + tile, left : left + tile], taken = code(piece, quality)
+            size += taken
     return made, size
+
+
+def code(tile: ImageArray, quality: int) -> tuple[ImageArray, int]:
+    """A tile as it decodes, and its bytes. Coded in fractions of a level, with room below black and above white."""
+    level = codec_htj2k.LEVEL
+    values = tile.astype(np.uint16) * level + (MIDDLE - 128 * level)
+    payload = codec_htj2k.encode(values, quality)
+    decoded = codec_htj2k.decode(payload, tile.shape, quality).astype(np.int32) - MIDDLE + 128 * level
+    return np.clip((decoded + level // 2) // level, 0, 255).astype(np.uint8), len(payload) + PIECE_BYTES

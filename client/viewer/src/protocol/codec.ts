@@ -4,6 +4,7 @@ import { RemoteWireError } from './errors.ts';
 import { jpegQ, restoreJpeg } from './codec_jpeg.ts';
 import { decodeLift } from './codec_lift.ts';
 import { decodeMask } from './codec_mask.ts';
+import { decodeColours } from './codec_colours.ts';
 import { LOSSLESS } from './codec_htj2k.ts';
 import type { Htj2kDecoder } from './codec_htj2k.ts';
 
@@ -47,8 +48,9 @@ export class Codecs {
     checkSize(payload, height, width, 3);
     if (codec === JPEG) return this.jpeg(restoreJpeg(payload, height, width, jpegQ(quality)), width, height);
     if (codec !== HTJ2K) throw new RemoteWireError(`no texture codec ${codec}`);
-    const rgb = (await this.htj2k()).decode(payload, { height, width, components: 3 }, quality);
-    return toRgba(rgb);
+    const htj2k = await this.htj2k();
+    if (quality !== LOSSLESS) return decodeColours(payload, height, width, quality, htj2k);
+    return toRgba(htj2k.decode(payload, { height, width, components: 3 }, quality));
   }
 
   /** A byte a cell, 1 where void. Throws RemoteWireError. */

@@ -8,14 +8,16 @@ export const LOSSLESS = 255;
 const LOSSY_MAX = 95;
 const LEVELS_MAX = 7;
 const TILE_HEADER_BYTES = 14;
-const NORM_LOW = [1.0, 1.4021, 2.0304, 2.9012, 4.1153, 5.8245, 8.2388, 11.652];
-const NORM_HIGH = [1.4425, 1.9669, 2.8839, 4.1475, 5.8946, 8.3472, 11.809];
+/** Of a lossy image's values: one of the 256 levels that a quality's step is counted in. */
+export const LEVEL = 32;
+const NORM_LOW = [1.0, 1.4021, 2.0304, 2.9012, 4.1153, 5.8245, 8.2388, 11.652].map(Math.fround);
+const NORM_HIGH = [1.4425, 1.9669, 2.8839, 4.1475, 5.8946, 8.3472, 11.809].map(Math.fround);
 const GROWTH = [[1, 1, 1], ...Array.from({ length: 4 }, () => [2, 2, 2]), [2, 2, 3], [2, 2, 3]];
 
 export interface ImageShape {
   height: number;
   width: number;
-  /** 3 for RGB bytes, 1 for 16-bit range. */
+  /** 3 for colours, 1 for range; of 16 bits, but lossless colours of 8. */
   components: 1 | 3;
 }
 
@@ -41,7 +43,7 @@ export class Htj2kDecoder {
     }
     const { width, height, componentCount, bitsPerSample } = this.decoder.getFrameInfo();
     const decoded = this.decoder.getDecodedBuffer();
-    const bytes = shape.components === 3 ? 1 : 2;
+    const bytes = sampleBits(shape, quality) / 8;
     const fits =
       width === shape.width && height === shape.height && componentCount === shape.components &&
       bitsPerSample === 8 * bytes && decoded.length === width * height * componentCount * bytes;
@@ -73,13 +75,16 @@ export function mainHeader(shape: ImageShape, quality: number): number[] {
   const { width, height, components } = shape;
   const size = new Bytes().u16(0x4000).u32(width).u32(height).u32(0).u32(0).u32(width).u32(height).u32(0).u32(0);
   size.u16(components);
-  for (let k = 0; k < components; k++) size.u8(components === 3 ? 7 : 15).u8(1).u8(1);
+  for (let k = 0; k < components; k++) size.u8(sampleBits(shape, quality) - 1).u8(1).u8(1);
   const coding = new Bytes().u8(0).u8(2).u16(1).u8(components === 3 ? 1 : 0).u8(levels);
   coding.u8(4).u8(4).u8(0x40).u8(lossless ? 1 : 0);
   const capability = new Bytes().u32(0x00020000).u16(magnitudeBound(bits) | (lossless ? 0 : 0x20));
   return new Bytes().u16(0xff4f).segment(0xff51, size).segment(0xff50, capability).segment(0xff52, coding)
     .segment(0xff5c, body).bytes;
 }
+
+const sampleBits = ({ components }: ImageShape, quality: number): number =>
+  components === 3 && quality === LOSSLESS ? 8 : 16;
 
 function decompositionLevels({ height, width }: ImageShape): number {
   const bitLength = 32 - Math.clz32(Math.min(height, width));
@@ -100,17 +105,22 @@ function reversible(levels: number, shape: ImageShape): Quantisation {
   return { body, bits: Math.max(...bits) };
 }
 
+/** In float32 as OpenJPH: some steps lie so near a tie that float64 would round them to another mantissa. */
 function irreversible(levels: number, quality: number): Quantisation {
-  const norms = [NORM_LOW[levels]! ** 2];
+  const bands = [{ norm: Math.fround(NORM_LOW[levels]! * NORM_LOW[levels]!), level: levels }];
   for (let level = levels; level > 0; level--) {
     const [low, high] = [NORM_LOW[level]!, NORM_HIGH[level - 1]!];
-    norms.push(low * high, low * high, high * high);
+    for (const norm of [low * high, low * high, high * high]) bands.push({ norm: Math.fround(norm), level });
   }
-  const step = 2 ** (-quality / 8);
-  const steps = norms.map((norm) => exponentAndMantissa(step / norm));
+  const step = Math.fround((2 ** (-quality / 8) * LEVEL * 256) / 65536);
   const body = new Bytes().u8(0x22);
-  for (const [exponent, mantissa] of steps) body.u16((exponent << 11) | mantissa);
-  return { body, bits: steps.at(-3)![0] };
+  let bits = 0;
+  for (const { norm, level } of bands) {
+    const [exponent, mantissa] = exponentAndMantissa(Math.fround(step / norm));
+    body.u16((exponent << 11) | mantissa);
+    bits = Math.max(bits, exponent + 1 - level);
+  }
+  return { body, bits };
 }
 
 /** [e, m] with step = 2^-e (1 + m / 2048). */
