@@ -18,6 +18,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from drivers.address import check_address
+from node.sealed import OPEN_IT, is_shut
 from protocol.errors import ConfigError, UsageError
 
 FILE_MAX_BYTES = 65536
@@ -122,7 +123,14 @@ class Library(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def path(self) -> Path:
-        """The folder, with ~ expanded. Raises ConfigError where nobody's home is known."""
+        """The folder, with ~ expanded. Raises ConfigError as `place` does, and while it is sealed and not open."""
+        if is_shut(self.place):
+            raise ConfigError(f"library.folder: {self.place} is sealed and not open: {OPEN_IT}")
+        return self.place
+
+    @property
+    def place(self) -> Path:
+        """The same, also while there is nothing to be read. Raises ConfigError where nobody's home is known."""
         try:
             return Path(self.folder).expanduser()
         except RuntimeError as problem:

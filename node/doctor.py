@@ -47,6 +47,7 @@ from node.machine import (
     written_last_s,
 )
 from node.scan_folder import name_problems
+from node.sealed import OPEN_IT, is_open, is_shut
 from node.tls import CREDENTIAL, certificate_file, key_file, read_certificate
 from protocol.errors import AccessError, ConfigError, LibraryError, PortLost
 from protocol.printable import counted
@@ -79,10 +80,14 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     """Every check, one after the other. path, overrides : as for load_config."""
     try:
         config = settings.load_config(path, overrides)
-        library = config.library.path
+        place = config.library.place
     except ConfigError as error:
         yield Finding("configuration", "problem", str(error), "correct the setting named; the rest was not looked at")
         return
+    if is_shut(place):
+        yield Finding("library", "problem", f"{place} is sealed and not open; the rest was not looked at", OPEN_IT)
+        return
+    library = config.library.path
     yield Finding("configuration", "ok", str(path) if path else "the defaults: no file was named")
     account, port = node_account(), config.capture.scanner
     who = _who_answers(config.server)
@@ -317,7 +322,7 @@ def check_library(folder: Path) -> Finding:
         known, problems = survey(folder)
     except LibraryError as error:
         return Finding("library", "problem", str(error), "choose another library.folder, or restore a backup")
-    found = f"{counted(len(known), 'scan')} in {folder}"
+    found = f"{counted(len(known), 'scan')} in {folder}{', sealed' if is_open(folder) else ''}"
     if not problems:
         return Finding("library", "ok", found)
     found += f", and beside them {counted(len(problems), 'thing')}: {name_problems(problems)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -14,6 +15,8 @@ from protocol.errors import LibraryError
 
 NEW = ".new"
 EASY_BYTES = 1 << 30  # with less left, a disk is nearly full
+PORTION_BYTES = 1 << 20
+BLOCK_BYTES = 4096  # what is lost at once, of a disk or of a sealed folder
 Kept = TypeVar("Kept")
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -70,6 +73,23 @@ def read_bounded(path: Path, bytes_max: int) -> bytes:
     if len(data) > bytes_max:
         raise LibraryError(f"its {path.name} is larger than {bytes_max} bytes")
     return data
+
+
+def read_through(file: int) -> None:
+    """Read a file to its end, so that what its disk cannot read is an OSError here, not a signal where it is mapped."""
+    portion, at = bytearray(PORTION_BYTES), 0
+    while count := os.preadv(file, [portion], at):
+        at += count
+
+
+def read_readable(file: int) -> bytes:
+    """A file's bytes, zero where its disk cannot read them."""
+    data = bytearray(os.fstat(file).st_size)
+    for at in range(0, len(data), BLOCK_BYTES):
+        with suppress(OSError):
+            piece = os.pread(file, BLOCK_BYTES, at)
+            data[at : at + len(piece)] = piece
+    return bytes(data)
 
 
 def decode_kept(data: bytes, kind: type[Kept], what: str) -> Kept:

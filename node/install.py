@@ -23,12 +23,17 @@ from protocol.errors import InstallError
 PROGRAM = "opt/foveascan"
 SETTINGS = "etc/foveascan"
 STATE = "var/lib/foveascan"
+SEALED = "var/lib/foveascan.sealed"
 CREDENTIAL = "etc/credstore/foveascan.key"
+LIBRARY_KEY = "etc/credstore.encrypted/foveascan.library-key"
 ACCOUNT = SERVICE = "foveascan"
+VAULT = "foveascan-vault"
 UNIT = "etc/systemd/system/foveascan.service"
+VAULT_UNIT = "etc/systemd/system/foveascan-vault.service"
 RULE = "etc/udev/rules.d/70-foveascan.rules"
 PLACES = {
     "foveascan.service": UNIT,
+    "foveascan-vault.service": VAULT_UNIT,
     "sysusers.conf": "etc/sysusers.d/foveascan.conf",
     "tmpfiles.conf": "etc/tmpfiles.d/foveascan.conf",
     "70-foveascan.rules": RULE,
@@ -82,14 +87,15 @@ class Installer:
     def remove(self, *, purge: bool) -> None:
         """Take the program and its unit away. purge : settings, scans and logins as well."""
         self._require_rights()
-        if self._starts and (self.root / UNIT).exists():
-            self._run("systemctl", "disable", "--now", SERVICE)
+        for unit, service in ((UNIT, SERVICE), (VAULT_UNIT, VAULT)):
+            if self._starts and (self.root / unit).exists():
+                self._run("systemctl", "disable", "--now", service)
         for place in (*PLACES.values(), PROGRAM):
             if place.startswith(SETTINGS):
                 continue
             self._delete(self.root / place)
         if purge:
-            for place in (SETTINGS, STATE, CREDENTIAL):
+            for place in (SETTINGS, STATE, SEALED, CREDENTIAL, LIBRARY_KEY):
                 self._delete(self.root / place)
         if self._starts:
             self._run("systemctl", "daemon-reload")

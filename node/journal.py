@@ -25,7 +25,7 @@ from pathlib import Path
 
 from drivers.ledger import Ledger
 from node.background_writer import BackgroundWriter
-from node.durable import NEW, disk_error, require_room, sync_folder, write_whole
+from node.durable import NEW, disk_error, read_readable, read_through, require_room, sync_folder, write_whole
 from node.journal_records import (
     ENTRY_OVERHEAD,
     RECORD_OVERHEAD,
@@ -331,6 +331,11 @@ def _map(path: Path) -> bytes | mmap.mmap:
         with open(path, "rb") as file:
             if os.fstat(file.fileno()).st_size == 0:
                 return b""
-            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            try:
+                read_through(file.fileno())
+            except OSError:
+                return read_readable(file.fileno())
+            return mapped
     except OSError as error:
         raise disk_error("it cannot be read", error) from error

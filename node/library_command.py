@@ -32,7 +32,7 @@ SCAN_HELP = "the id, the beginning of one, or latest"
 
 def add_library_command(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `library` and what it can do."""
-    library = subparsers.add_parser("library", help="list, show, rename, delete, verify, back up and restore scans")
+    library = subparsers.add_parser("library", help="look at scans and look after them: list, delete, back up, seal")
     actions = library.add_subparsers(title="actions", metavar="ACTION", required=True)
     _add(actions, "list", run_list, "the scans, newest first, and whatever else lies there")
     _add(actions, "show", run_show, "a scan and what is said of it").add_argument("scan", help=SCAN_HELP)
@@ -54,6 +54,14 @@ def add_library_command(subparsers: argparse._SubParsersAction[argparse.Argument
     prune.add_argument("--yes", action="store_true", help="do not ask")
     restore = _add(actions, "restore", run_restore, "take in the scans of a backup: all or none")
     restore.add_argument("file", type=Path, help="a file that `backup` wrote")
+    key_help = "a file that holds it, in one line"
+    seal = _add(actions, "seal", run_seal, "encrypt all of it on the disk; goes on where it was cut")
+    seal.add_argument("--key", required=True, metavar="FILE", help=key_help)
+    unseal = _add(actions, "unseal", run_unseal, "undo that")
+    unseal.add_argument("--key", required=True, metavar="FILE", help=key_help)
+    rekey = _add(actions, "rekey", run_rekey, "have a sealed library opened by another key from now on")
+    rekey.add_argument("--key", required=True, metavar="FILE", help="the one it has")
+    rekey.add_argument("--new-key", required=True, metavar="FILE", help="the one it gets")
 
 
 def _add(
@@ -201,6 +209,44 @@ def run_restore(args: argparse.Namespace) -> int:
     said = {"added": list(restored.added), "kept": list(restored.kept)}
     text = f"{counted(len(restored.added), 'scan')} restored, {len(restored.kept)} kept that were here already"
     return _tell(args, said, text)
+
+
+def run_seal(args: argparse.Namespace) -> int:
+    """Encrypt the library."""
+    from node.sealing import seal
+
+    return _change_seal(args, seal, "sealed")
+
+
+def run_unseal(args: argparse.Namespace) -> int:
+    """Have it in the clear again."""
+    from node.sealing import unseal
+
+    return _change_seal(args, unseal, "unsealed")
+
+
+def _change_seal(
+    args: argparse.Namespace, change: Callable[[Path, bytes, Callable[[int], object]], None], done: str
+) -> int:
+    from tqdm import tqdm
+
+    from node.sealed import read_key
+    from node.sealing import size_bytes
+
+    folder, key = _config(args).library.place, read_key(Path(args.key))
+    with tqdm(total=size_bytes(folder), disable=None, leave=False, unit="B", unit_scale=True) as bar:
+        change(folder, key, bar.update)
+    return _tell(args, {done: str(folder)}, f"{done} {folder}")
+
+
+def run_rekey(args: argparse.Namespace) -> int:
+    """Exchange the key of a sealed library."""
+    from node.sealed import read_key
+    from node.sealing import rekey
+
+    folder = _config(args).library.place
+    rekey(folder, read_key(Path(args.key)), read_key(Path(args.new_key)))
+    return _tell(args, {"rekeyed": str(folder)}, f"{folder} opens with the new key, and with the old one no more")
 
 
 def _folder(args: argparse.Namespace) -> Path:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -58,8 +59,9 @@ class Lock:
     def release(self) -> None:
         """Let go of it; harmless when repeated."""
         if self._handle >= 0:
-            os.close(self._handle)
-            self._handle = -1
+            handle, self._handle = self._handle, -1
+            with suppress(OSError):  # the disk is gone, and the lock with it
+                os.close(handle)
 
     def __del__(self) -> None:
         self.release()

@@ -29,7 +29,7 @@ from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
 from exchange.native import NOTE_MAX
-from node.durable import decode_kept, read_bounded, sync_folder, write_whole
+from node.durable import decode_kept, read_bounded, read_through, sync_folder, write_whole
 from node.scan_quality import ScanQuality
 from protocol.errors import LibraryError
 from protocol.grid import Grid, GridSpec, ImageArray, RepairArray, StepArray, no_repairs
@@ -175,9 +175,21 @@ def _read_repairs(path: Path) -> RepairArray:
 def read_sound_grid(folder: Path, spec: GridSpec) -> Grid:
     """A scan's samples, mapped, and the same as when they were kept. Raises LibraryError."""
     grid = read_grid(folder, spec)
+    for name in (RANGE_FILE, TEXTURE_FILE, REPAIRS_FILE):
+        _read_through(folder / name)
     if content_id(grid) != folder.name:
         raise LibraryError("its samples are not what they were when it was kept")
     return grid
+
+
+def _read_through(path: Path) -> None:
+    try:
+        with open(path, "rb") as file:
+            read_through(file.fileno())
+    except FileNotFoundError:
+        return  # there are no repairs
+    except OSError as error:
+        raise LibraryError(f"its {path.name} cannot be read: {error.strerror}") from error
 
 
 def write_scan(library: Path, record: Record, grid: Grid) -> None:

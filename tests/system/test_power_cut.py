@@ -18,9 +18,11 @@ from node.assemble import Assembly
 from node.library import About, Library, content_id
 from node.library_folder import OWN, SWEEPS
 from node.resume import publish_complete
+from node.sealing import seal
+from tests.node.sealed_places import KEY, open_at, require_mounts
 from tests.system.power_cut_worker import grid
 
-ROUNDS_OF_EACH = 6
+ROUNDS_OF_EACH, ROUNDS_SEALED = 6, 2
 PHASES = ["sweep", "add", "annotate", "delete", "restore"]
 WORKER = Path(__file__).with_name("power_cut_worker.py")
 
@@ -68,14 +70,26 @@ def worker() -> Iterator[subprocess.Popen[str]]:
 
 
 def test_nothing_complete_is_lost_and_nothing_partial_stays(worker: subprocess.Popen[str], tmp_path: Path) -> None:
-    folder, rng, promises, told = tmp_path / "library", random.Random(36), Promises(), Counter[str]()
+    work_and_cut(worker, tmp_path / "library", tmp_path, ROUNDS_OF_EACH)
+
+
+def test_a_sealed_library_loses_no_more(worker: subprocess.Popen[str], tmp_path: Path) -> None:
+    require_mounts()
+    seal(tmp_path / "library", KEY, lambda size_bytes: None)
+    with open_at(tmp_path / "library"):
+        work_and_cut(worker, tmp_path / "library", tmp_path, ROUNDS_SEALED)
+
+
+def work_and_cut(worker: subprocess.Popen[str], folder: Path, diaries: Path, rounds: int) -> None:
+    """Cut each kind of work so often, and look each time at what is left."""
+    rng, promises, told = random.Random(36), Promises(), Counter[str]()
     library = Library(folder)
     fill(library, 0)
     library.close()
     promises.kept = {scan.id for scan in library.scans()}
-    for number in range(ROUNDS_OF_EACH * len(PHASES)):
+    for number in range(rounds * len(PHASES)):
         phase = PHASES[number % len(PHASES)]
-        diary = tmp_path / f"diary-{number}"
+        diary = diaries / f"diary-{number}"
         cut(worker, phase, 1000 * (1 + number), folder, diary, rng.uniform(0.0, 0.15))
         promises.read(diary.read_text())
         left = {name.split("-")[0] for name in os.listdir(folder) if name.startswith(".")}
@@ -89,7 +103,7 @@ def test_nothing_complete_is_lost_and_nothing_partial_stays(worker: subprocess.P
         library.close()
         promises.doubtful = set()
         promises.kept = {scan.id for scan in library.scans()}
-    assert sum(told.values()) >= ROUNDS_OF_EACH, f"hardly a cut hit anything: {told}"
+    assert sum(told.values()) >= rounds, f"hardly a cut hit anything: {told}"
 
 
 def fill(library: Library, seed: int) -> None:

@@ -1,0 +1,172 @@
+"""A sealed library: encrypted on the disk by gocryptfs, and to be read only while that is mounted.
+
+    <folder>            the library, while it is open; an empty folder else
+    <folder>.sealed     what lies on the disk: encrypted files under encrypted names, and gocryptfs.conf, which holds
+                        the data key, encrypted with the operator's
+
+    .<folder>.sealing, .away, .coming, .gone        while it is being sealed or unsealed (node.sealing)
+
+The key is one line of text; nothing of it is kept here.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from node.durable import read_bounded, sync_folder
+from protocol.errors import LibraryError
+
+SUFFIX = ".sealed"
+CONF = "gocryptfs.conf"
+KIND = "fuse.gocryptfs"
+MOUNTS = Path("/proc/self/mountinfo")
+KEY_CHARACTERS = 22, 500  # 128 bits in base64; what gocryptfs takes
+NEW_KEY = "head -c 32 /dev/urandom | base64 -w0"
+STRETCH = "10"  # the least: a key is random, and nothing is won by making its trial slow
+MOUNT_S = 30.0
+OPEN_IT = "systemctl start foveascan-vault, or mount it (README, \"A sealed library\")"
+WRONG_KEY = 12  # gocryptfs's status
+_ESCAPED = {"\\040": " ", "\\011": "\t", "\\012": "\n", "\\134": "\\"}
+
+
+def sealed_folder(folder: Path) -> Path:
+    """Where a sealed library lies on the disk."""
+    return folder.with_name(folder.name + SUFFIX)
+
+
+def beside(folder: Path, word: str) -> Path:
+    """Where something lies while a library is being sealed or unsealed."""
+    return folder.with_name(f".{folder.name}.{word}")
+
+
+def is_sealed(folder: Path) -> bool:
+    """Whether a library lies sealed on the disk."""
+    return (sealed_folder(folder) / CONF).exists()
+
+
+def is_open(folder: Path) -> bool:
+    """Whether a folder lies in what gocryptfs has mounted now. Raises OSError."""
+    place, best, kind = str(folder.absolute()), "", ""
+    if folder.exists():
+        place = str(folder.resolve())
+    for line in MOUNTS.read_text().splitlines():
+        words = line.split()
+        point = words[4]
+        for code, char in _ESCAPED.items():
+            point = point.replace(code, char)
+        if len(point) >= len(best) and (place + "/").startswith(point.rstrip("/") + "/"):
+            best, kind = point, words[words.index("-") + 1]
+    return kind == KIND
+
+
+def is_shut(folder: Path) -> bool:
+    """Whether a library is sealed and not open, so that whatever is written here would lie in the clear beside it."""
+    begun = any(beside(folder, word).exists() for word in ("away", "gone"))
+    return (begun or is_sealed(folder)) and not is_open(folder)
+
+
+def holds_something(folder: Path) -> bool:
+    """Whether there is a folder that is not empty."""
+    try:
+        with os.scandir(folder) as entries:
+            return next(entries, None) is not None
+    except FileNotFoundError:
+        return False
+
+
+def read_key(path: Path) -> bytes:
+    """The key in a file. Raises LibraryError where that is no line of text, or one to be guessed; OSError."""
+    data = read_bounded(path, 4096).strip(b"\r\n")
+    least, most = KEY_CHARACTERS
+    if not least <= len(data) <= most or not all(0x20 <= byte < 0x7F for byte in data):
+        raise LibraryError(f"{path} holds no key, which is a line of {least} to {most} characters: {NEW_KEY} > {path}")
+    return data
+
+
+def make_sealed(sealed: Path, key: bytes) -> None:
+    """Make an empty sealed folder, unless it is there. Raises LibraryError, OSError."""
+    if (sealed / CONF).exists():
+        return
+    if sealed.exists():
+        shutil.rmtree(sealed)
+    sealed.mkdir(mode=0o700)
+    _run("-init", "-scryptn", STRETCH, str(sealed), said=key)
+    sync_folder(sealed)
+
+
+def change_key(sealed: Path, old: bytes, new: bytes) -> None:
+    """Encrypt the data key with another one, at once; no scan is written. Raises LibraryError."""
+    _run("-passwd", "-scryptn", STRETCH, str(sealed), said=old + b"\n" + new)
+
+
+@contextmanager
+def opened(sealed: Path, place: Path, key: bytes) -> Iterator[Path]:
+    """A sealed folder's content, in a folder that nobody else may look into. Raises LibraryError, OSError."""
+    shut(place)  # whoever had it open was killed
+    place.mkdir(mode=0o700, exist_ok=True)
+    with tempfile.TemporaryFile() as said:
+        command = ["gocryptfs", "-fg", "-q", "-nosyslog", str(sealed), str(place)]
+        process = _started(command, said.fileno())
+        try:
+            assert process.stdin is not None
+            with process.stdin:
+                process.stdin.write(key + b"\n")
+            _await_mount(process, place, said.fileno())
+            yield place
+        finally:
+            shut(place)
+            if process.poll() is None:
+                process.terminate()
+            process.wait()
+            place.rmdir()
+
+
+def shut(place: Path) -> None:
+    """Unmount a folder, if something of gocryptfs's is mounted there. Raises LibraryError."""
+    if not os.path.ismount(place):
+        return
+    command = ["umount"] if os.geteuid() == 0 else ["fusermount3", "-u"]
+    done = subprocess.run([*command, str(place)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise LibraryError(f"cannot shut {place}: {' '.join(done.stderr.split())}; end whoever uses it")
+
+
+def _started(command: list[str], errors: int) -> subprocess.Popen[bytes]:
+    try:
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
+    except FileNotFoundError:
+        raise LibraryError("a sealed library needs gocryptfs; as root: apt-get install gocryptfs fuse3") from None
+
+
+def _await_mount(process: subprocess.Popen[bytes], place: Path, errors: int) -> None:
+    deadline_s = time.monotonic() + MOUNT_S
+    while not os.path.ismount(place):
+        if process.poll() is not None:
+            raise _refusal(process.returncode, os.pread(errors, 4096, 0))
+        if time.monotonic() > deadline_s:
+            raise LibraryError(f"gocryptfs has not mounted {place} within {MOUNT_S:.0f} s")
+        time.sleep(0.01)
+
+
+def _run(*arguments: str, said: bytes) -> None:
+    """Have gocryptfs do something. said : lines for its standard input, so that no list of processes shows a key."""
+    with tempfile.TemporaryFile() as errors:
+        process = _started(["gocryptfs", "-q", "-nosyslog", *arguments], errors.fileno())
+        process.communicate(said + b"\n")
+        if process.returncode:
+            raise _refusal(process.returncode, os.pread(errors.fileno(), 4096, 0))
+
+
+def _refusal(status: int, said: bytes) -> LibraryError:
+    if status == WRONG_KEY:
+        return LibraryError("this key does not open the library: give the one that it was sealed with; nothing changed")
+    lines = said.decode(errors="replace").split("\n")
+    why = next((line.strip() for line in reversed(lines) if line.strip()), f"status {status}")
+    return LibraryError(f"gocryptfs: {why}")
