@@ -40,7 +40,8 @@ mount -t sysfs -o ro sysfs sys; mount -t tmpfs tmpfs sys/fs/cgroup 2> /dev/null 
 mount -t cgroup2 cgroup2 sys/fs/cgroup
 touch "$BED/kmsg"
 mount -t tmpfs -o mode=755 tmpfs dev
-for node in null zero full random urandom tty; do touch dev/$node; mount --bind /dev/$node dev/$node; done
+nodes="null zero full random urandom tty"; [ ! -e /dev/fuse ] || nodes="$nodes fuse"
+for node in $nodes; do touch dev/$node; mount --bind /dev/$node dev/$node; done
 touch dev/kmsg; mount --bind "$BED/kmsg" dev/kmsg
 mkdir dev/pts dev/shm; mount -t devpts -o newinstance,ptmxmode=0666 devpts dev/pts; ln -s pts/ptmx dev/ptmx
 mount -t tmpfs tmpfs dev/shm; ln -s /proc/self/fd dev/fd

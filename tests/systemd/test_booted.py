@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from simulators.usb_testbed import PRELOAD, is_available
+from tests.node.sealed_places import require_mounts
 from tests.systemd.booted import ROOT, Machine, booted, why_not
 
 WHY_NOT = why_not()
@@ -234,6 +235,38 @@ def test_an_update_runs_and_one_that_does_not_come_up_leaves_what_was_running(ma
     assert machine.run("readlink", "/opt/foveascan/bin").stdout == second
     machine.await_property("ActiveState", "active")
     assert health(machine, port) == {"status": "ready"}
+
+
+def test_a_library_is_sealed_by_the_commands_of_the_readme(machine: Machine, port: int) -> None:
+    require_mounts()
+    before, vault = scans(machine, port), "foveascan-vault"
+    block = (ROOT / "README.md").read_text().partition("\n## A sealed library\n")[2].partition("\n    ")[2]
+    apt, *commands = [line.strip() for line in block.partition("\n\n")[0].splitlines()]
+    assert apt == "apt-get install gocryptfs fuse3"
+    machine.run("sh", "-c", "set -e\n" + "\n".join(commands))
+    machine.await_property("ActiveState", "active")
+    assert health(machine, port) == {"status": "ready"}
+    assert before and scans(machine, port) == before
+    key = machine.run("cat", "/run/key").stdout
+    looked = machine.run("grep", "-raF", key, "/etc", "/var/lib/foveascan.sealed", check=False)
+    assert looked.returncode == 1 and before[0] not in machine.run("find", "/var/lib/foveascan.sealed").stdout
+    machine.run("systemctl", "kill", "-s", "KILL", vault)
+    until = time.monotonic() + 60
+    while (told := machine.run("systemctl", "show", "--value", "-p", "NRestarts", vault).stdout.strip()) != "1":
+        assert time.monotonic() < until, told
+        time.sleep(0.1)
+    machine.await_property("ActiveState", "active")
+    assert scans(machine, port) == before
+    machine.run("systemctl", "stop", vault)
+    machine.await_property("ActiveState", "inactive")
+    assert machine.run("ls", "-A", "/var/lib/foveascan").stdout == ""
+    shut = machine.foveascan("library", "list", "--library", "/var/lib/foveascan", check=False)
+    assert "is sealed and not open: systemctl start foveascan-vault" in shut
+    machine.foveascan("library", "unseal", "--library", "/var/lib/foveascan", "--key", "/run/key")
+    machine.run("systemctl", "disable", vault)
+    machine.run("rm", "/etc/credstore.encrypted/foveascan.library-key")
+    machine.run("systemctl", "start", "foveascan")
+    assert scans(machine, port) == before
 
 
 def test_it_stops_in_time_and_goes_without_a_trace_but_what_is_kept(machine: Machine) -> None:
