@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from node.axis import Axis
-from node.axis_correction import corrected
+from node.axis_correction import correct
 from node.laps import OUTLIER_SIGMAS, average, difference_sigma, shift_between
 from node.repair import Repaired, repair
 from node.resampling import (
@@ -141,7 +141,9 @@ class Assembler:
         if repairs:
             repaired = repair(grid, quality.noise_mm or 0.0, axis)
         else:
-            repaired = Repaired(corrected(grid, axis) if axis else grid, 0, 0)
+            if axis is not None:
+                correct(grid, axis)
+            repaired = Repaired(grid, 0, 0)
         found = survey(repaired.grid)
         said = replace(
             quality,

@@ -26,16 +26,14 @@ _BEYOND_RAD = math.pi / 2
 
 
 
-def corrected(grid: Grid, axis: Axis) -> Grid:
-    """A grid without repairs about the true axis. Its texture is moved in place."""
-    steps = corrected_range(grid.range_steps, grid.spec, axis)
-    correct_texture(grid.texture, steps, grid.spec, axis)
-    return Grid(grid.spec, steps, grid.texture)
+def correct(grid: Grid, axis: Axis) -> None:
+    """Lay a grid without repairs about the true axis, in place: its arrays are nobody else's yet."""
+    correct_range(grid.range_steps, grid.spec, axis)
+    correct_texture(grid.texture, grid.range_steps, grid.spec, axis)
 
 
-def corrected_range(steps: StepArray, spec: GridSpec, axis: Axis) -> StepArray:
-    """Range about the true axis. steps : (H, W) uint16 as measured, 0 = void. Returns the same, as a new array."""
-    corrected = np.empty_like(steps)
+def correct_range(steps: StepArray, spec: GridSpec, axis: Axis) -> None:
+    """Lay range about the true axis, in place. steps : (H, W) uint16 as measured, 0 = void."""
     columns = np.arange(spec.width, dtype=np.float32)
     heights = spec.height_mm(np.arange(spec.height)).astype(np.float32)
     for start in range(0, spec.height, _BAND):
@@ -45,16 +43,15 @@ def corrected_range(steps: StepArray, spec: GridSpec, axis: Axis) -> StepArray:
         values = radius_mm / np.float32(spec.step_mm)
         values[(steps[rows] == VOID) | (np.abs(ahead_rad) >= _BEYOND_RAD)] = VOID
         at = columns + ahead_rad * np.float32(spec.width / (2 * np.pi))
-        corrected[rows] = laid_out(values, at, is_cyclic=True)
+        steps[rows] = laid_out(values, at, is_cyclic=True)
     if not axis.leans:
-        return corrected
+        return
     for start in range(0, spec.width, _BAND):
         part = slice(start, start + _BAND)
-        values = np.ascontiguousarray(corrected[:, part].T, np.float32)
+        values = np.ascontiguousarray(steps[:, part].T, np.float32)
         z_mm = true_height(axis, values * np.float32(spec.step_mm), heights)
         at = (np.float32(spec.z_max_mm) - z_mm) / np.float32(spec.pitch_mm) - np.float32(0.5)
-        corrected[:, part] = laid_out(values, at, is_cyclic=False).T
-    return corrected
+        steps[:, part] = laid_out(values, at, is_cyclic=False).T
 
 
 def laid_out(values: Lengths, at: Lengths, *, is_cyclic: bool) -> StepArray:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from node.axis import Axis
-from node.axis_correction import correct_texture, corrected_cells, corrected_range
+from node.axis_correction import correct, corrected_cells
 from protocol.grid import VOID, BoolArray, Grid, IntArray, StepArray
 
 HOLE_CELLS_MAX = 3
@@ -40,17 +40,16 @@ def repair(grid: Grid, noise_mm: float = 0.0, axis: Axis | None = None) -> Repai
     """Take spikes out and fill small holes of a grid as it was measured; one without any is returned as it is.
 
     The same measurement gives the same grid, bit for bit; `undone` is the inverse.
-    axis : where the table's axis is, if not where the sensor believes it. Then the grid is laid about that one, its
-    texture in place: without the spikes, which would be smeared, and before holes are filled, so that a hole is a hole
-    of the new grid. What was measured at a spike stands in the repairs, where it would stand.
+    axis : where the table's axis is, if not where the sensor believes it. Then the grid is laid about that one, in
+    place: without the spikes, which would be smeared, and before holes are filled, so that a hole is a hole of the new
+    grid. What was measured at a spike stands in the repairs, where it would stand.
     """
     tall_mm = max(SPIKE_ROWS * grid.spec.pitch_mm, SPIKE_SIGMAS * noise_mm)
     changed = spikes_in(grid.range_steps, tall_mm / grid.spec.step_mm)
     spikes = int(changed.sum())
-    steps = np.where(changed, np.uint16(VOID), grid.range_steps) if spikes else grid.range_steps
     if axis is not None:
-        grid, changed = _about_axis(grid, steps, changed, axis)
-        steps = np.where(changed, np.uint16(VOID), grid.range_steps) if spikes else grid.range_steps
+        _correct(grid, changed, axis)
+    steps = np.where(changed, np.uint16(VOID), grid.range_steps) if spikes else grid.range_steps
     filled, values = fill(steps, np.argwhere(small_holes(steps == VOID)))
     changed[tuple(filled.T)] = True
     cells = np.argwhere(changed)
@@ -62,16 +61,22 @@ def repair(grid: Grid, noise_mm: float = 0.0, axis: Axis | None = None) -> Repai
     return Repaired(Grid(grid.spec, steps, grid.texture, repairs), spikes, len(filled))
 
 
-def _about_axis(grid: Grid, steps: StepArray, spikes: BoolArray, axis: Axis) -> tuple[Grid, BoolArray]:
-    """A grid with its spikes about the true axis, and where they are there. steps : (H, W) without them."""
-    about = corrected_range(steps, grid.spec, axis)
-    correct_texture(grid.texture, about, grid.spec, axis)
-    cells, surface = fill(steps, np.argwhere(spikes))
-    cells, measured = corrected_cells(cells, grid.range_steps[tuple(cells.T)], surface, grid.spec, axis)
-    there = np.zeros_like(spikes)
-    there[tuple(cells.T)] = True
-    about[tuple(cells.T)] = measured
-    return Grid(grid.spec, about, grid.texture), there
+def _correct(grid: Grid, spikes: BoolArray, axis: Axis) -> None:
+    """Lay a grid about the true axis as if it had no spikes, then put them where they would be. Both in place.
+
+    spikes : (H, W), where they are, and then where they would be.
+    """
+    steps = grid.range_steps
+    cells = np.argwhere(spikes)
+    measured = steps[tuple(cells.T)]
+    steps[tuple(cells.T)] = VOID
+    found, surface = fill(steps, cells)
+    known = np.isin(cells @ (steps.shape[1], 1), found @ (steps.shape[1], 1))
+    correct(grid, axis)
+    cells, measured = corrected_cells(found, measured[known], surface, grid.spec, axis)
+    steps[tuple(cells.T)] = measured
+    spikes[:] = False
+    spikes[tuple(cells.T)] = True
 
 
 def undone(grid: Grid) -> Grid:

@@ -40,6 +40,7 @@ AWAY_S = 0.6
 PASSES = 4  # of M over USB: long enough to be measured
 UNPACED = float("inf")
 POLL_S = 0.1
+OFF_AXIS = ("0.8", "-0.5", "0.005", "-0.004")
 SETTLED_S = 1.0
 BEGIN_S, WINDOW_S, UNPACED_WINDOW_S = 0.5, 2.0, 1.0  # of a sweep; in between the node is asked nothing
 UNPACED_PASSES = 8
@@ -72,6 +73,7 @@ def run(repeats: int) -> dict[str, Any]:
         "driver_paced": driver(1 << 16, repeats, USB_BYTES_S, PACED_BYTES),
         "recovery_s": recovery(repeats),
         "assembly": assembly(repeats),
+        "assembly_off_axis": assembly(repeats, *OFF_AXIS),
     }
 
 
@@ -235,11 +237,14 @@ async def _published(url: str) -> None:
         await anext(published)
 
 
-def assembly(repeats: int) -> dict[str, float]:
-    """A grid of L, its quality and repairs, after its last column: seconds, and memory as a multiple of its arrays."""
+def assembly(repeats: int, *axis: str) -> dict[str, float]:
+    """A grid of L, its quality and repairs, after its last column: seconds, and memory as a multiple of its arrays.
+
+    axis : lateral, radial, lean, side of one that it is corrected for.
+    """
     told = []
     for _ in range(repeats):
-        with worker("assemble") as said:
+        with worker("assemble", *axis) as said:
             told.append(json.loads(said.readline()))
     return {
         "seconds": median(one["seconds"] for one in told),
@@ -323,9 +328,10 @@ def told(record: dict[str, Any]) -> str:
     paced = record["driver_paced"]
     lines.append(f"USB driver alone, paced: {paced['mb_s']:.0f} MB/s, {_percent(paced['core'])} of a core")
     lines.append(f"first column after the plug is back: {record['recovery_s']:.2f} s")
-    grid = record["assembly"]
-    took = f"{grid['seconds']:.2f} s, {grid['cpu_s']:.2f} s of processor time"
-    lines.append(f"a grid of L after its last column: {took}, {grid['times_arrays']:.2f} times its arrays")
+    for name, what in (("assembly", ""), ("assembly_off_axis", ", corrected for an axis that leans off centre")):
+        grid = record[name]
+        took = f"{grid['seconds']:.2f} s, {grid['cpu_s']:.2f} s of processor time"
+        lines.append(f"a grid of L after its last column{what}: {took}, {grid['times_arrays']:.2f} times its arrays")
     return "\n".join(lines)
 
 

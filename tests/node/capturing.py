@@ -14,6 +14,7 @@ import numpy as np
 from drivers.scanner import ScannerConfig, SweepEvent, SweepInterrupted, SweepProgress
 from drivers.serial_port import SerialPort
 from node.assemble import Assembly
+from node.axes import Axes
 from node.capture import Capture
 from node.journal import Journals
 from node.repair import undone
@@ -72,10 +73,12 @@ class Node:
         self.grids: queue.Queue[Grid] = queue.Queue()
         self.events: queue.Queue[SweepEvent] = queue.Queue()
         self.sweeps = Journals(folder)
+        self.axes = Axes(folder.parent)
         self.deliver: Callable[[Grid], None] = self.grids.put
         self.qualities: list[ScanQuality] = []
         self.capture = Capture(
             lambda: SerialPort(str(link)), ScannerConfig(progress_s=0.02), self.take, self.events.put, self.sweeps,
+            axes=self.axes,
         )  # fmt: skip
 
     def take(self, assembly: Assembly) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from node.axes import KnownAxis
 from node.axis import Axis
+from node.axis_correction import correct
 from node.axis_fit import Estimate
 from protocol.grid import FloatArray, Grid, GridSpec, mm_to_steps
 
@@ -68,3 +69,10 @@ def swept(
     range_mm = np.where(strays, rng.uniform(20, 90, range_mm.shape), range_mm)
     steps = mm_to_steps(np.where(range_mm > 1, range_mm, np.nan), spec.step_mm)
     return Grid(spec, steps, np.zeros((spec.texture_height, spec.texture_width, 3), np.uint8))
+
+
+def corrected(grid: Grid, axis: Axis) -> Grid:
+    """A copy of a grid, laid about an axis."""
+    copy = Grid(grid.spec, grid.range_steps.copy(), grid.texture.copy())
+    correct(copy, axis)
+    return copy

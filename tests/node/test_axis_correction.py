@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from node.axis import Axis
-from node.axis_correction import correct_texture, corrected, corrected_range, laid_out
+from node.axis_correction import correct_texture, laid_out
 from node.repair import repair, undone
 from protocol.grid import STEPS_MAX, VOID, Grid, GridSpec
 from simulators.off_axis import OffAxis, seen_off_axis
 from simulators.specimen import make_specimen
-from tests.node.round_bodies import Body, seen_mm, spec_of, swept
+from tests.node.round_bodies import Body, corrected, seen_mm, spec_of, swept
 
 OFFSETS = [OffAxis(0.8, -0.5), OffAxis(-1.5, 1.0, 0.3, -0.4)]
 
@@ -43,7 +43,7 @@ def psnr_db(grid: Grid, truth: Grid) -> float:
 def test_nothing_changes_where_the_axis_is_where_it_should_be() -> None:
     grid = specimen("head")
     for axis in (Axis(0.0, 0.0), Axis(0.0, 0.0, lean_rad=1e-12)):
-        about = corrected(Grid(grid.spec, grid.range_steps, grid.texture.copy()), axis)
+        about = corrected(grid, axis)
         assert np.array_equal(about.range_steps, grid.range_steps) and np.array_equal(about.texture, grid.texture)
 
 
@@ -66,15 +66,15 @@ def test_what_rays_saw_of_an_object_becomes_the_object(name: str, fine_mm: float
 def test_a_body_is_where_it_stands_to_a_few_steps() -> None:
     axis, spec = Axis(2.0, 1.5, 0.01, -0.02, 75.0), spec_of(1440, 200)
     truth = seen_mm(Axis(0.0, 0.0), Body(), spec)
-    about = corrected_range(swept(axis, spec=spec).range_steps, spec, axis) * spec.step_mm
+    about = corrected(swept(axis, spec=spec), axis).range_steps * spec.step_mm
     inside = about[10:-10] != VOID
     assert inside.all() and np.abs(about - truth)[10:-10].max() < 0.004
 
 
 def test_noise_does_not_grow() -> None:
     axis, spec = Axis(2.0, 1.5, 0.01, -0.02, 75.0), spec_of()
-    truth = corrected_range(swept(axis).range_steps, spec, axis) * spec.step_mm
-    noisy = corrected_range(swept(axis, noise_mm=0.05).range_steps, spec, axis) * spec.step_mm
+    truth = corrected(swept(axis), axis).range_steps * spec.step_mm
+    noisy = corrected(swept(axis, noise_mm=0.05), axis).range_steps * spec.step_mm
     assert np.std((noisy - truth)[10:-10]) < 0.05
 
 
@@ -103,10 +103,10 @@ def test_a_lone_sample_stays_one() -> None:
 
 def test_what_leaves_the_grid_or_the_scale_is_void() -> None:
     spec = GridSpec(16, 4, 16, 4, 0.01, 1.0)
-    steps = np.full((4, 16), 60_000, np.uint16)
-    assert not corrected_range(steps, spec, Axis(0.0, 0.01 * (STEPS_MAX + 1))).any()
-    assert not corrected_range(steps, spec, Axis(0.0, -700.0)).any()  # beyond the axis
-    assert not corrected_range(steps, spec, Axis(0.0, 0.0, 0.1)).any()  # 60 mm lower
+    grid = Grid(spec, np.full((4, 16), 60_000, np.uint16), np.zeros((4, 16, 3), np.uint8))
+    assert not corrected(grid, Axis(0.0, 0.01 * (STEPS_MAX + 1))).range_steps.any()
+    assert not corrected(grid, Axis(0.0, -700.0)).range_steps.any()  # beyond the axis
+    assert not corrected(grid, Axis(0.0, 0.0, 0.1)).range_steps.any()  # 60 mm lower
 
 
 def test_texture_goes_with_its_range_where_that_is_void_too() -> None:
@@ -134,8 +134,8 @@ def test_spikes_are_taken_out_before_and_told_where_they_would_stand(axis: Axis)
     for place in places:
         steps[place] += 4000
     steps[30, 100] = steps[31, 100] = VOID
-    repaired = repair(Grid(grid.spec, steps, grid.texture.copy()), 0.0, axis)
-    truth = corrected_range(clean.range_steps, grid.spec, axis)
+    repaired = repair(Grid(grid.spec, steps, grid.texture), 0.0, axis)
+    truth = corrected(clean, axis).range_steps
     error = np.abs(repaired.grid.range_steps.astype(int) - truth) * grid.spec.step_mm
     assert repaired.spikes == 4 and error[8:-8].max() < 0.1
     told = undone(repaired.grid).range_steps.astype(int) - truth

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from node.axis import Axis
-from node.axis_correction import corrected
 from node.axis_fit import Estimate, NotCalibrated, Samples, estimate, off_surface
 from protocol.grid import Grid
 from simulators.specimen import make_specimen
-from tests.node.round_bodies import Body, spec_of, swept
+from tests.node.round_bodies import Body, corrected, spec_of, swept
 
 MIDDLE_MM = 75.0
 TRUE = Axis(0.8, -0.5, 0.004, -0.003, MIDDLE_MM)

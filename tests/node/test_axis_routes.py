@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from node.axis import Axis
-from node.axis_correction import corrected
 from node.library import About, Library
 from node.scan_quality import ScanQuality
 from protocol.grid import Grid
-from tests.node.round_bodies import swept
+from tests.node.round_bodies import corrected, swept
 from tests.node.served import Client, served
 
 TRUE = Axis(0.8, -0.5, 0.004, -0.003, 75.0)

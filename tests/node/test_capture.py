@@ -16,6 +16,7 @@ from node import capture, durable
 from node.assemble import Assembly
 from node.capture import Capture, CaptureStatus, Manner
 from node.journal import Journals
+from node.repair import repair
 from node.scan_quality import coverage_of
 from protocol.errors import PortLost
 from protocol.grid import Grid
@@ -25,6 +26,7 @@ from simulators.scanner import SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.turntable import Turntable
 from tests.node.capturing import TRUTH, WAIT_S, Node, Plug, device, is_truth
+from tests.node.round_bodies import KNOWN
 
 
 def test_a_sweep_becomes_a_grid_and_its_journal_goes(plug: Plug, node: Node, tmp_path: Path) -> None:
@@ -37,6 +39,29 @@ def test_a_sweep_becomes_a_grid_and_its_journal_goes(plug: Plug, node: Node, tmp
         assert node.capture.status.sweeps == count
     assert list((tmp_path / "sweeps").iterdir()) == []
     assert node.sweeps.interrupted() == []
+
+
+def test_grids_are_corrected_for_the_axis_of_their_scanner_as_it_is_set(plug: Plug, node: Node) -> None:
+    axis = KNOWN.estimate.axis
+    node.axes.keep(replace(KNOWN, settings=1))
+    plug.plug(device(calibration=1))
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    grid = node.grids.get(timeout=WAIT_S)
+    wanted = repair(Grid(TRUTH.spec, TRUTH.range_steps.copy(), TRUTH.texture.copy()), 0.0, axis).grid
+    assert np.array_equal(grid.range_steps, wanted.range_steps) and np.array_equal(grid.texture, wanted.texture)
+    assert np.array_equal(grid.repairs, wanted.repairs) and not is_truth(grid)
+    node.wait_until("ready")
+    plug.pull()
+    node.wait_until("connecting")
+    plug.plug(device(calibration=2))
+    node.wait_until("ready")
+    assert node.capture.request_sweep()
+    assert is_truth(node.grids.get(timeout=WAIT_S))
+    node.wait_until("ready")
+    first, later = node.qualities
+    assert first.axis == axis and not first.axis_trouble
+    assert later.axis is None and "its settings changed since: calibrate again" in later.complaints[0]
 
 
 def test_who_hears_of_a_scan_may_ask_for_the_next_one_at_once(plug: Plug, node: Node) -> None:
