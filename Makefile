@@ -10,7 +10,7 @@ PAGE := $(VIEWER)/dist/.stamp
 PAGE_SOURCES := $(shell find $(VIEWER)/src -type f) $(addprefix $(VIEWER)/,package-lock.json build.mjs index.html)
 
 .DELETE_ON_ERROR:
-.PHONY: install demo test lint bench lock clean
+.PHONY: install demo test nightly lint bench lock clean
 
 install: $(VENV)/.app $(PAGE)
 
@@ -19,6 +19,9 @@ demo: install
 
 test: install
 	$(RUN) pytest -q -n auto --dist loadfile $(ARGS)
+
+nightly: install
+	$(BIN)/python tests/nightly/machine.py $(ARGS)
 
 lint: install
 	$(BIN)/ruff check .
@@ -38,7 +41,7 @@ lock: $(VENV)/.pip
 		--generate-hashes --no-annotate --no-header --no-emit-index-url - -o constraints-node.txt > /dev/null
 
 clean:
-	rm -rf $(VENV) dist $(VIEWER)/dist $(VIEWER)/node_modules .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .nightly dist $(VIEWER)/dist $(VIEWER)/node_modules .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.pip:

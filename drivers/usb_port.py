@@ -71,7 +71,7 @@ class UsbPort:
         self._is_cancelled = False
         self._is_closed = False
         self._lost: str | None = None
-        self._detached: int | None = None
+        self._detached: list[int] = []
         self._device = _find(address, backend)
         try:
             with self._translated("open"):
@@ -133,9 +133,9 @@ class UsbPort:
 
     def _let_go(self) -> None:
         """Give the device back to whoever had it."""
-        with suppress(*_GONE):
-            if self._detached is not None:
-                self._device.attach_kernel_driver(self._detached)
+        for interface in self._detached:
+            with suppress(*_GONE):  # the driver may have taken it along with the one before
+                self._device.attach_kernel_driver(interface)
         with suppress(*_GONE):
             usb.util.dispose_resources(self._device)
 
@@ -231,17 +231,21 @@ class UsbPort:
             ends = [_bulk(interface, direction) for direction in (usb.util.ENDPOINT_IN, usb.util.ENDPOINT_OUT)]
             if all(ends):
                 number = interface.bInterfaceNumber
-                self._detach(number)
+                self._detach(configuration, number)
                 usb.util.claim_interface(self._device, number)
                 return number, *ends
         raise ValueError("it has no interface with bulk endpoints both ways, so it is no scanner of this kind")
 
-    def _detach(self, interface: int) -> None:
-        """Have the kernel's own driver let go of an interface, if it has one; it gets it back at the end."""
+    def _detach(self, configuration: Any, interface: int) -> None:
+        """Have the kernel's own driver let go of an interface, if it has one; it gets it back at the end.
+
+        With it go interfaces that the same driver has beside it: a serial port's has two, and comes back by the first.
+        """
         with suppress(NotImplementedError):  # a system whose kernel takes no interface has nothing to let go
-            if self._device.is_kernel_driver_active(interface):
+            driven = [number for number in _numbers(configuration) if self._device.is_kernel_driver_active(number)]
+            if interface in driven:
                 self._device.detach_kernel_driver(interface)
-                self._detached = interface
+                self._detached = [number for number in driven if not self._device.is_kernel_driver_active(number)]
 
 
 def _find(address: UsbAddress, backend: Any) -> Any:
@@ -262,6 +266,11 @@ def _find(address: UsbAddress, backend: Any) -> Any:
 
 def _has_serial(device: Any, wanted: str | None) -> bool:
     return wanted is None or device.serial_number == wanted
+
+
+def _numbers(configuration: Any) -> list[int]:
+    """Of its interfaces, each once whatever settings it has."""
+    return sorted({interface.bInterfaceNumber for interface in configuration})
 
 
 def _bulk(interface: Any, direction: int) -> Any:

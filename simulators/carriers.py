@@ -164,37 +164,14 @@ class MemoryPort:
             raise PortLost(f"{self.name}: unplugged")
 
 
-class PtyPort:
-    """The scanner's end of a pseudo terminal that lets bytes through no faster than a serial line of `baud`.
+class TerminalPort:
+    """The scanner's end of a serial line: a terminal that an heir opens, read and written at the pace of a rate."""
 
-    link_path : a symbolic link that leads to the node's end; it exists as long as this is open.
-    """
-
-    def __init__(self, link_path: Path, baud: int = 3_000_000) -> None:
-        self.name = str(link_path)
-        self._link_path = link_path
-        self._pace = Pace(baud / _BITS_PER_BYTE)
-        _check_free(link_path)
+    def __init__(self, name: str, rate_bytes_s: float) -> None:
+        self.name = name
+        self._pace = Pace(rate_bytes_s)
         self._wake_read, self._wake_write = os.pipe()
-        self._master = self._slave = -1
-        self.plug_in()
-
-    def plug_in(self) -> None:
-        """Make a line and the link that leads to it."""
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._target = os.ttyname(self._slave)
-        _replace_link(self._link_path, self._target)
-
-    def hang_up(self) -> None:
-        """What pulling the plug looks like: the line is gone, and so is the link."""
-        with suppress(OSError):
-            if os.readlink(self._link_path) == self._target:
-                os.unlink(self._link_path)
-        for descriptor in (self._master, self._slave):
-            os.close(descriptor)
-        self._master = self._slave = -1
+        self._master = -1  # while the plug is out
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read."""
@@ -219,12 +196,47 @@ class PtyPort:
         """As Port.cancel."""
         os.write(self._wake_write, b"x")
 
+    def hang_up(self) -> None:
+        """Pull the plug."""
+        raise NotImplementedError
+
     def close(self) -> None:
         """Hang up for good."""
         if self._master >= 0:
             self.hang_up()
         for descriptor in (self._wake_read, self._wake_write):
             os.close(descriptor)
+
+
+class PtyPort(TerminalPort):
+    """The scanner's end of a pseudo terminal that lets bytes through no faster than a serial line of `baud`.
+
+    link_path : a symbolic link that leads to the node's end; it exists as long as this is open.
+    """
+
+    def __init__(self, link_path: Path, baud: int = 3_000_000) -> None:
+        _check_free(link_path)
+        super().__init__(str(link_path), baud / _BITS_PER_BYTE)
+        self._link_path = link_path
+        self._slave = -1
+        self.plug_in()
+
+    def plug_in(self) -> None:
+        """Make a line and the link that leads to it."""
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._target = os.ttyname(self._slave)
+        _replace_link(self._link_path, self._target)
+
+    def hang_up(self) -> None:
+        """What pulling the plug looks like: the line is gone, and so is the link."""
+        with suppress(OSError):
+            if os.readlink(self._link_path) == self._target:
+                os.unlink(self._link_path)
+        for descriptor in (self._master, self._slave):
+            os.close(descriptor)
+        self._master = self._slave = -1
 
 
 def serve(scanner: Device, port: ServedPort, stop: threading.Event, portion_bytes: int = PORTION_BYTES) -> None:

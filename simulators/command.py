@@ -10,6 +10,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from simulators.faults import FaultyScanner
     from simulators.specimen import Specimen
 
+LINKS = ("pty", "tcp", "usb", "gadget", "acm")
+_SERIAL = ("pty", "acm")
 BITS_PER_BYTE = 10  # on a serial line: start, eight data, stop
 BAUD = 3_000_000
 USB_BYTES_S = 35e6
@@ -28,13 +31,14 @@ SPECIMEN_HELP = "head, nutcracker, sphere, cylinder, post, pebble, or a .npz gri
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Offer `simulate`."""
     simulate = subparsers.add_parser("simulate", help="a software scanner with known truth")
-    simulate.add_argument("--link", choices=("pty", "tcp", "usb"), default="pty", help="what the node opens (pty)")
+    simulate.add_argument("--link", choices=LINKS, default="pty", help="what the node opens (pty)")
     simulate.add_argument(
         "--path",
         required=True,
         type=Path,
         help="pty: symbolic link to create for the node to open; tcp: PORT or HOST:PORT to listen at (this machine"
-        " alone; 0: any free port); usb: folder for the emulated device",
+        " alone; 0: any free port); usb: folder for the emulated device; gadget, acm: a device controller of this"
+        " machine, as in /sys/class/udc, by which it is a real USB device, or a real serial port on USB (as root)",
     )
     simulate.add_argument(
         "--specimen",
@@ -52,7 +56,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
         "--jitter", type=_real(0, 1e6), default=0.0, metavar="COUNTS", help="deviation of the triggers (0)"
     )
     speed = simulate.add_mutually_exclusive_group()
-    baud_help = "of the line (pty: 3000000; tcp, usb: 35e6 bytes a second)"
+    baud_help = "of the line (pty, acm: 3000000; tcp, usb, gadget: 35e6 bytes a second)"
     speed.add_argument("--baud", type=_whole(300, 10**9), help=baud_help)
     speed.add_argument(
         "--link-rate", type=link_rate, metavar="BYTES_S", help="bytes a second over the line, instead of --baud"
@@ -100,7 +104,7 @@ def run_simulate(args: argparse.Namespace) -> int:
         if path is not None and grid is not None:
             with whole_file(path) as file:
                 write_native(grid, file, specimen.name)
-    portion = PORTION_BYTES if args.link == "pty" else USB_PORTION_BYTES
+    portion = PORTION_BYTES if args.link in _SERIAL else USB_PORTION_BYTES
     with _port(args) as (port, about), _stopped_by_signals(port) as stop:
         print(_ready(args, specimen, about), flush=True)
         serve(scanner, port, stop, portion)
@@ -135,7 +139,7 @@ def _scanner(args: argparse.Namespace, specimen: Specimen) -> FaultyScanner:
             serial_number=args.serial_number,
             boot_id=boot_id,
             retention_columns=args.retention,
-            payload_max=SERIAL_PAYLOAD_MAX if args.link == "pty" else USB_PAYLOAD_MAX,
+            payload_max=SERIAL_PAYLOAD_MAX if args.link in _SERIAL else USB_PAYLOAD_MAX,
             order=Order[args.order.upper()],
             channels=channels[args.channels],
         )
@@ -148,7 +152,9 @@ def _port(args: argparse.Namespace) -> Iterator[tuple[ServedPort, dict[str, Any]
     """The scanner's end of the line, and what the node has to know of it."""
     from simulators.carriers import PtyPort
     from simulators.tcp_carrier import TcpListener, parse_listen
-    from simulators.usb_descriptors import UsbIdentity
+    from simulators.tty_gadget import TtyGadget
+    from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
+    from simulators.usb_gadget import UsbGadget
     from simulators.usb_testbed import UsbTestbed
 
     rate_bytes_s = args.link_rate or (args.baud or 0) / BITS_PER_BYTE
@@ -156,6 +162,14 @@ def _port(args: argparse.Namespace) -> Iterator[tuple[ServedPort, dict[str, Any]
         identity = UsbIdentity(serial_number=args.serial_number)
         with closing(UsbTestbed(args.path, identity, rate_bytes_s or USB_BYTES_S)) as bed:
             yield bed, {"path": identity.address, "environment": bed.environment}
+    elif args.link == "gadget":
+        identity = UsbIdentity(serial_number=args.serial_number)
+        with closing(UsbGadget(str(args.path), identity, rate_bytes_s or USB_BYTES_S)) as usb_gadget:
+            yield usb_gadget, {"path": usb_gadget.name}
+    elif args.link == "acm":
+        identity = replace(CDC_IDENTITY, serial_number=args.serial_number)
+        with closing(TtyGadget(str(args.path), identity, rate_bytes_s or BAUD / BITS_PER_BYTE)) as tty_gadget:
+            yield tty_gadget, {"path": tty_gadget.name}
     elif args.link == "tcp":
         with closing(TcpListener(parse_listen(str(args.path)), rate_bytes_s or USB_BYTES_S)) as listener:
             yield listener, {"path": listener.name}

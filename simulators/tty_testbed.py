@@ -9,20 +9,19 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from simulators.usb_descriptors import UsbIdentity
+from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
 from simulators.usb_uevent import announce
 
 _MESSAGE = struct.Struct("<QQQ")
 _DONE, _NOT_MINE = 3, (1 << 64) - 100  # "not handled here": the preload then asks the pty itself
 _USB = "sys/devices/pci0000:00/usb1/1-2"
 _TTY = f"{_USB}/1-2:1.0/tty"
-_CDC_DATA = UsbIdentity(product=0x5CA2)
 
 
 class TtyTestbed:
     """Plugs pseudo terminals in as /dev/ttyACM<n>, with ids and a serial number, under a folder."""
 
-    def __init__(self, root: Path, identity: UsbIdentity = _CDC_DATA) -> None:
+    def __init__(self, root: Path, identity: UsbIdentity = CDC_IDENTITY) -> None:
         self.identity = identity
         self._root = root
         for folder in ("sys/bus/usb/devices", "sys/class/tty", "dev/serial/by-id", "ioctl"):

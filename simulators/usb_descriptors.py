@@ -34,10 +34,8 @@ class UsbIdentity:
 
     def configuration_descriptor(self) -> bytes:
         """One configuration, one interface, bulk in and bulk out."""
-        ends = [struct.pack("<BBBBHB", 7, 5, address, _BULK, PACKET_BYTES, 0) for address in (BULK_IN, BULK_OUT)]
-        interface = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, len(ends), _VENDOR_CLASS, 0, 0, 0)
-        total = 9 + len(interface) + sum(map(len, ends))
-        return struct.pack("<BBHBBBBB", 9, 2, total, 1, 1, 0, 0x80, 250) + interface + b"".join(ends)
+        body = bulk_interface() + bulk_endpoint(BULK_IN, PACKET_BYTES) + bulk_endpoint(BULK_OUT, PACKET_BYTES)
+        return struct.pack("<BBHBBBBB", 9, 2, 9 + len(body), 1, 1, 0, 0x80, 250) + body
 
     def string_descriptor(self, index: int) -> bytes | None:
         """String number `index`, or None where there is none."""
@@ -48,3 +46,16 @@ class UsbIdentity:
             return None
         data = texts[index - 1].encode("utf-16le")
         return struct.pack("BB", len(data) + 2, 3) + data
+
+
+CDC_IDENTITY = UsbIdentity(product=0x5CA2)  # of a scanner that is a serial port
+
+
+def bulk_interface() -> bytes:
+    """Interface 0, with a bulk endpoint each way."""
+    return struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 2, _VENDOR_CLASS, 0, 0, 0)
+
+
+def bulk_endpoint(address: int, packet_bytes: int) -> bytes:
+    """One end of it."""
+    return struct.pack("<BBBBHB", 7, 5, address, _BULK, packet_bytes, 0)

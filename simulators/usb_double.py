@@ -21,18 +21,18 @@ _WAITING_MAX = 64
 class UsbDouble(usb.backend.IBackend):  # type: ignore[misc]
     """The device's bulk pipes: `read` and `write` are the device's end, as PtyPort's are.
 
-    is_forbidden, is_taken, has_driver : what opening meets.    stalls : transfers that will be refused by a halted
-    endpoint until it is cleared.
+    is_forbidden, is_taken, has_driver : what opening meets.    is_serial : its bulk endpoints are in the second of two
+    interfaces, and the kernel's driver takes both or none, by the first.    stalls : transfers that will be
+    refused by a halted endpoint until it is cleared.
     """
 
     def __init__(self, identity: UsbIdentity | None = None) -> None:
         self.identity = identity or UsbIdentity()
         self.name = self.identity.address
-        self.is_forbidden = self.is_taken = self.has_driver = False
+        self.is_forbidden = self.is_taken = self.has_driver = self.is_serial = False
         self.stalls = 0
         self.is_halted = False
         self.is_plugged = True
-        self.attached_again = False
         self._changed = threading.Condition()
         self._to_node: deque[bytes] = deque()
         self._to_device: deque[bytes] = deque()
@@ -97,15 +97,16 @@ class UsbDouble(usb.backend.IBackend):  # type: ignore[misc]
         """As pyusb wants it."""
         _only(config)
         return SimpleNamespace(
-            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1, bConfigurationValue=1, iConfiguration=0,
-            bmAttributes=0x80, bMaxPower=250, extra_descriptors=[],
+            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1 + self.is_serial, bConfigurationValue=1,
+            iConfiguration=0, bmAttributes=0x80, bMaxPower=250, extra_descriptors=[],
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: Any, intf: int, alt: int, config: int) -> SimpleNamespace:
         """As pyusb wants it."""
-        _only(intf, alt, config)
+        _only(alt, config, intf > self.is_serial)
         return SimpleNamespace(
-            bLength=9, bDescriptorType=4, bInterfaceNumber=0, bAlternateSetting=0, bNumEndpoints=2,
+            bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0,
+            bNumEndpoints=2 if intf == self.is_serial else 0,
             bInterfaceClass=0xFF, bInterfaceSubClass=0, bInterfaceProtocol=0, iInterface=0, extra_descriptors=[],
         )  # fmt: skip
 
@@ -152,8 +153,10 @@ class UsbDouble(usb.backend.IBackend):  # type: ignore[misc]
         self.has_driver = False
 
     def attach_kernel_driver(self, dev_handle: object, intf: int) -> None:
-        """The kernel may have it again."""
-        self.attached_again = True
+        """The kernel has it again, if it is asked by the first interface."""
+        if intf or self.has_driver:
+            raise usb.core.USBError("Entity not found", -5, errno.ENOENT)
+        self.has_driver = True
 
     def clear_halt(self, dev_handle: object, ep: int) -> None:
         """The endpoint goes on."""

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 
@@ -131,11 +132,13 @@ def test_a_device_opened_twice_is_refused_the_second_time(double: UsbDouble, por
         UsbPort(ADDRESS, double)
 
 
-def test_the_kernels_driver_lets_go_and_gets_it_back() -> None:
+@pytest.mark.parametrize("is_serial", [False, True])
+def test_the_kernels_driver_lets_go_and_gets_it_back(is_serial: bool) -> None:
     double = UsbDouble()
-    double.has_driver = True
-    UsbPort(ADDRESS, double).close()
-    assert double.attached_again
+    double.has_driver, double.is_serial = True, is_serial
+    with closing(UsbPort(ADDRESS, double)):
+        assert not double.has_driver
+    assert double.has_driver
 
 
 @pytest.mark.parametrize("wanted", [None, "SIM-0007"])

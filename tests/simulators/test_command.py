@@ -171,3 +171,10 @@ def test_a_faulty_buffered_scanner_still_serves_the_truth(tmp_path: Path) -> Non
 def test_a_usb_scanner_tells_the_environment_the_node_needs(tmp_path: Path) -> None:
     with simulated(tmp_path / "usb", "--link", "usb", "--specimen", "sphere") as (_, ready):
         assert ready["path"] == "usb:1209:5ca1" and ready["environment"]["UMOCKDEV_DIR"] == str(tmp_path / "usb")
+
+
+@pytest.mark.parametrize("link", ["gadget", "acm"])
+def test_a_gadget_without_a_controller_says_how_to_get_one(link: str) -> None:
+    args = parse("--path", "no_udc.0", "--link", link, "--specimen", "cylinder")
+    with pytest.raises(OSError, match="as root: modprobe|no such device controller; there is"):
+        args.run(args)

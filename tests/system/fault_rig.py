@@ -5,7 +5,6 @@ In memory, time is the carrier's own and nothing waits; on a pty or USB a thread
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -16,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from drivers.discover import open_port
 from drivers.port import Port
 from drivers.scanner import Scanner, ScannerConfig, SweepEvent, SweepFinished, SweepInterrupted, SweepStarted
 from drivers.serial_port import SerialPort
@@ -36,9 +36,9 @@ from simulators.scanner import ANY_CHANNELS, SimulatedScanner
 from simulators.specimen import Specimen
 from simulators.tcp_carrier import TcpListener
 from simulators.turntable import Turntable
-from simulators.usb_descriptors import UsbIdentity
+from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
 from simulators.usb_double import UsbDouble
-from simulators.usb_testbed import UsbTestbed
+from tests.system.usb_bed import acm_bed, usb_bed
 
 SPEC = GridSpec(48, 520, 96, 360, 0.01, 0.5)  # two pieces in each column, on serial
 OVERLAP = 64
@@ -145,14 +145,23 @@ def usb_double(bench: Bench) -> Iterator[Line]:
 
 @contextmanager
 def usb(bench: Bench) -> Iterator[Line]:
-    """The driver for USB on the real libusb, with an emulated device; only under umockdev's preload."""
+    """The driver for USB on the real libusb, with an emulated device or a gadget: see usb_bed.py."""
     if bench.faults == "dribble=1":  # every transfer costs the emulation a millisecond
         bench = replace(bench, faults="dribble=100")
     identity = UsbIdentity(serial_number=bench.serial_number)
-    bed = UsbTestbed(Path(os.environ["UMOCKDEV_DIR"]), identity, place=bench.place)
-    with closing(bed), _served(replace(bench, payload_max=USB_PAYLOAD_MAX), bed):
+    bench = replace(bench, payload_max=USB_PAYLOAD_MAX)
+    with closing(usb_bed(identity, place=bench.place)) as bed, _served(bench, bed):
         address = UsbAddress.parse(f"{bed.identity.address}:{bench.serial_number}")
         yield Line(lambda: UsbPort(address), time.monotonic, time.sleep, USB_CONFIG)
+
+
+@contextmanager
+def acm(bench: Bench) -> Iterator[Line]:
+    """A serial port on real USB; only where there is a device controller."""
+    identity = replace(CDC_IDENTITY, serial_number=bench.serial_number)
+    with closing(acm_bed(identity, bench.place)) as gadget, _served(bench, gadget):
+        address = f"{gadget.name}:{bench.serial_number}"
+        yield Line(lambda: open_port(address), time.monotonic, time.sleep, ScannerConfig(quiet_s=0.8))
 
 
 @contextmanager

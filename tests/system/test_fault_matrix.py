@@ -15,7 +15,7 @@ from node.scan_quality import ScanQuality
 from protocol.errors import PortLost
 from protocol.scanner_messages import Channel, Order, SweepRequest
 from simulators.scanner import APART, TOGETHER
-from simulators.usb_testbed import is_available, is_under_preload
+from simulators.usb_testbed import is_available
 from tests.system.fault_rig import (
     REQUEST,
     SPEC,
@@ -23,6 +23,7 @@ from tests.system.fault_rig import (
     Capturing,
     Ending,
     Line,
+    acm,
     bumpy,
     memory,
     pty,
@@ -30,10 +31,13 @@ from tests.system.fault_rig import (
     usb,
     usb_double,
 )
+from tests.system.usb_bed import CONTROLLERS, HAS_USB
 
 Carrier = Callable[[Bench], AbstractContextManager[Line]]
-CARRIERS = {"memory": memory, "pty": pty, "tcp": tcp}
-if is_under_preload():  # in the process that test_usb.py starts
+CARRIERS: dict[str, Carrier] = {"memory": memory, "pty": pty, "tcp": tcp}
+if CONTROLLERS:  # in a machine of nightly's
+    CARRIERS = {"usb": usb, "acm": acm}
+elif HAS_USB:  # in the process that test_usb.py starts
     CARRIERS["usb"] = usb
 elif not is_available():
     CARRIERS["usb_double"] = usb_double  # the driver without libusb, where umockdev is missing
@@ -64,7 +68,7 @@ def carrier(request: pytest.FixtureRequest) -> Carrier:
     return CARRIERS[request.param]
 
 
-@pytest.fixture(params=[name for name in CARRIERS if name.startswith(("pty", "usb"))])
+@pytest.fixture(params=[name for name in CARRIERS if name.startswith(("pty", "usb", "acm"))])
 def wire(request: pytest.FixtureRequest) -> Carrier:
     """What a scanner hangs on; ways to sweep go wrong there or nowhere."""
     return CARRIERS[request.param]
@@ -132,7 +136,7 @@ def test_two_scanners_at_once_do_not_disturb_each_other(carrier: Carrier, tmp_pa
 
 
 def test_one_port_opened_twice_is_refused_the_second_time(carrier: Carrier, tmp_path: Path) -> None:
-    if carrier not in (pty, usb):
+    if carrier not in (pty, usb, acm):
         pytest.skip("what keeps a second program out is the kernel, or its emulation")
     with carrier(Bench("", 7, tmp_path)) as line, closing(line.open_port()):
         with pytest.raises(PortLost, match="another program"):

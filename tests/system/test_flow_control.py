@@ -24,15 +24,15 @@ from node.assemble import Assembly
 from node.capture import Capture
 from node.journal import Journals
 from simulators.faults import FaultyScanner
-from simulators.usb_testbed import is_under_preload
 from tests.system.fault_rig import Bench, Line, bumpy, pty, usb
 from tests.system.line import RunningNode
 from tests.system.test_soak import S
+from tests.system.usb_bed import HAS_USB
 
 CLIENTS = 16
 WINDOW_BYTES = 16384
 STANDS_S = 0.5  # a table that waits no longer may only wait for its turn
-CARRIERS = {"usb": usb} if is_under_preload() else {"pty": pty}  # usb: in the process that test_usb.py starts
+CARRIERS = {"usb": usb} if HAS_USB else {"pty": pty}  # usb: in the process that test_usb.py starts
 
 
 async def look_on(url: str, number: int) -> None:
@@ -72,7 +72,7 @@ async def until_updated(session: Session, looking: list[asyncio.Task[None]]) -> 
     assert not any(task.done() for task in looking)
 
 
-@pytest.mark.skipif(is_under_preload(), reason="the daemon is a process of its own")
+@pytest.mark.skipif(HAS_USB, reason="the daemon is a process of its own")
 def test_sixteen_clients_that_look_cost_a_sweep_no_column(line: Callable[..., RunningNode], tmp_path: Path) -> None:
     node = line("--specimen", "sphere", "--size", "S")
     scan, requested = asyncio.run(sweep_beside(node.url))

@@ -29,7 +29,7 @@ def run_under_preload(root: Path, *arguments: str, timeout_s: float = 110) -> su
 
 @pytest.mark.parametrize(
     "tests",
-    ["test_fault_matrix.py -k [usb", "test_flow_control.py", "usb_emulated.py", "usb_capture.py", "tty_emulated.py"],
+    ["test_fault_matrix.py -k [usb", "test_flow_control.py", "usb_device.py", "usb_capture.py", "tty_emulated.py"],
 )
 def test_on_an_emulated_device(tests: str, tmp_path: Path) -> None:
     file, *chosen = tests.split()

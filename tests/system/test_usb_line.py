@@ -1,4 +1,4 @@
-"""The whole line over emulated USB: `foveascan simulate --link usb`, the daemon on libusb, the public client."""
+"""The whole line over USB, emulated or a kernel's: `foveascan simulate`, the daemon on libusb, the public client."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from foveascan import PROGRAM, started
 from protocol.grid import Grid
 from simulators.usb_testbed import PRELOAD, is_available
 from tests.system.line import RunningNode, run_line
+from tests.system.usb_bed import CONTROLLERS
 
 SEED = 7
 Swept = Callable[..., tuple[RunningNode, Grid]]
@@ -27,7 +28,7 @@ Swept = Callable[..., tuple[RunningNode, Grid]]
 
 @pytest.fixture(autouse=True)
 def _preload() -> None:
-    if not is_available() and "CI" not in os.environ:
+    if not is_available() and not CONTROLLERS and "CI" not in os.environ:
         pytest.skip(f"no {PRELOAD} here; as root: apt-get install umockdev libusb-1.0-0")
 
 
@@ -46,14 +47,20 @@ def swept(folder: Path) -> Swept:
         place = folder / link
         place.mkdir()
         with ExitStack() as stack:
-            path = ["--path", str(place / "scanner")]
-            chosen = ["--link", link, *path, "--specimen", "head", "--seed", str(SEED), *simulate]
+            chosen = [*line_of(link, place / "scanner"), "--specimen", "head", "--seed", str(SEED), *simulate]
             node = run_line(stack, place, *chosen)
             asyncio.run(fetch_scan(node.url, "latest", place / "scan.npz", moved=lambda moved, total: None))
             with open(place / "scan.npz", "rb") as file:
                 return node, read_native(file)[1]
 
     return sweep
+
+
+def line_of(link: str, path: Path) -> list[str]:
+    """How a scanner is simulated: on emulated lines, but on a kernel's where it has device controllers."""
+    if CONTROLLERS:
+        return ["--link", {"usb": "gadget", "pty": "acm"}[link], "--path", CONTROLLERS[0]]
+    return ["--link", link, "--path", str(path)]
 
 
 def test_one_seed_gives_one_scan_over_a_serial_line_and_over_usb(swept: Swept) -> None:  # AT-02
@@ -75,9 +82,9 @@ def test_a_bad_line_costs_the_scan_nothing(swept: Swept, link: str, channels: st
 
 
 def test_the_doctor_examines_a_scanner_on_usb(folder: Path) -> None:
-    with started("simulate", "--link", "usb", "--path", str(folder / "usb"), "--turn", "0.2", "--json") as (_, ready):
+    with started("simulate", *line_of("usb", folder / "usb"), "--turn", "0.2", "--json") as (_, ready):
         chosen = ("doctor", "--link", ready["path"], "--json")
-        environment = {**os.environ, **ready["environment"]}
+        environment = {**os.environ, **ready.get("environment", {})}
         ran = subprocess.run(
             [*PROGRAM, *chosen], env=environment, capture_output=True, text=True, timeout=60, check=False
         )

@@ -1,8 +1,7 @@
-"""The node's capture thread on an emulated USB device, as pytest; run by test_usb.py under umockdev's preload."""
+"""The node's capture thread on USB, as pytest; run by test_usb.py under umockdev's preload, nightly on a kernel."""
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 import time
@@ -22,8 +21,8 @@ from protocol.framing import USB_PAYLOAD_MAX
 from protocol.grid import Grid
 from protocol.scanner_messages import RangeColumn, TextureColumn
 from simulators.carriers import serve
-from simulators.usb_testbed import UsbTestbed
 from tests.system.fault_rig import Bench
+from tests.system.usb_bed import usb_bed
 
 AWAY_S = 0.6
 RECOVERED_S = 20.0  # two seconds on a machine that is not loaded: `foveascan bench capture` measures it
@@ -34,9 +33,9 @@ Told = list[tuple[float, SweepEvent]]
 
 @contextmanager
 def scanner(bench: Bench) -> Iterator[str]:
-    """The emulated device, served by a thread; the address the node opens."""
+    """The device, served by a thread; the address the node opens."""
     stop = threading.Event()
-    with closing(UsbTestbed(Path(os.environ["UMOCKDEV_DIR"]), rate_bytes_s=1e6)) as bed:
+    with closing(usb_bed(rate_bytes_s=1e6)) as bed:
         thread = threading.Thread(target=serve, args=(bench.scanner(), bed, stop))
         thread.start()
         try:
