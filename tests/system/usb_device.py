@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import struct
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
 
 import pytest
+import usb.core
 
 from drivers.usb_port import READ_BYTES, UsbAddress, UsbPort
 from protocol.errors import PortLost
+from simulators.pace import CATCH_UP_S
 from simulators.usb_descriptors import PACKET_BYTES, UsbIdentity
 from simulators.usb_gadget import UsbGadget
 from simulators.usb_testbed import UsbTestbed
@@ -18,6 +24,7 @@ from tests.system.usb_bed import usb_bed
 
 Bed = UsbTestbed | UsbGadget
 SOON_S = 30.0
+CAPABILITIES_3, DAC_OVERRIDE_AND_SEARCH = 0x20080522, 0b110  # of linux/capability.h
 ADDRESS = UsbAddress.parse(UsbIdentity().address)
 
 
@@ -82,6 +89,40 @@ def test_a_stalled_endpoint_is_cleared_and_goes_on(bed: Bed, port: UsbPort) -> N
         bed.write(word)
         assert read_all(port, 1) == word
     assert bed.stalls == 0
+
+
+def test_a_paced_device_is_no_faster_than_its_rate() -> None:
+    rate_bytes_s, data = 1e6, os.urandom(30_000)
+    with closing(usb_bed(rate_bytes_s=rate_bytes_s)) as bed, closing(UsbPort(ADDRESS)) as port:
+        began_s = time.monotonic()
+        for _ in range(10):
+            bed.write(data)
+            assert read_all(port, len(data)) == data
+        took_s = time.monotonic() - began_s
+    assert took_s > 10 * len(data) / rate_bytes_s - CATCH_UP_S
+
+
+def test_without_permission_the_udev_rule_is_named(bed: Bed) -> None:
+    device = usb.core.find(idVendor=ADDRESS.vendor, idProduct=ADDRESS.product)
+    node = Path(f"{os.environ.get('UMOCKDEV_DIR', '')}/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
+    node.chmod(0)
+    with bound_by_permissions(), pytest.raises(PortLost, match=f'no permission.*=="{ADDRESS.vendor:04x}".*rules.d'):
+        UsbPort(ADDRESS)
+    node.chmod(0o600)
+    UsbPort(ADDRESS).close()
+
+
+@contextmanager
+def bound_by_permissions() -> Iterator[None]:
+    """As anybody but root: without the capabilities by which this thread may open everything."""
+    libc, who, had = ctypes.CDLL(None), struct.pack("<Ii", CAPABILITIES_3, 0), ctypes.create_string_buffer(24)
+    assert libc.capget(who, had) == 0
+    effective, *rest = struct.unpack("<6I", had.raw)
+    assert libc.capset(who, struct.pack("<6I", effective & ~DAC_OVERRIDE_AND_SEARCH, *rest)) == 0
+    try:
+        yield
+    finally:
+        assert libc.capset(who, had) == 0
 
 
 def test_unplugging_ends_a_pending_read_at_once(bed: Bed, port: UsbPort) -> None:
