@@ -60,18 +60,25 @@ def _is_every_cell(window: Window) -> bool:
 
 
 def _spread(blocks: BoolArray, window: Window) -> BoolArray:
-    """Whether a sample of an axis hangs on any block that is true. (blocks, n) to (samples, n) bool."""
-    count = window.size.size
-    block = np.arange(count).repeat(window.size)
-    position = np.arange(block.size)
-    if window.beyond:
-        block, position = np.append(block, np.arange(count)), np.append(position, np.cumsum(window.size))
-    between = window.part[position] > 0
-    pairs = np.append(window.low[position] * count + block, (window.high[position] * count + block)[between])
-    sample, block = np.divmod(np.unique(pairs), count)
-    hangs = np.zeros((window.sample.size, blocks.shape[1]), np.bool_)
-    starts = np.flatnonzero(np.diff(sample, prepend=-1))
-    hangs[sample[starts]] = np.logical_or.reduceat(blocks[block], starts, axis=0)
+    """Whether a sample of an axis hangs on any block that is true. (blocks, n) to (samples, n) bool.
+
+    Samples follow each other, so each block hangs on a run of them, all round one that may begin before sample 0.
+    """
+    count, samples = window.size.size, window.sample.size
+    if count == 1:
+        return blocks.repeat(samples, axis=0)
+    stop = np.cumsum(window.size)
+    last = stop - 1 + window.beyond
+    begin, low = window.low[stop - window.size], window.low[last]
+    end = np.where(window.part[last] > 0, window.high[last], low)
+    begin, end = begin - samples * (begin > low), end + samples * (end < low)
+    upto = np.zeros((count + 1, blocks.shape[1]), np.int32)
+    np.cumsum(blocks, axis=0, out=upto[1:])
+    hangs = np.zeros((samples, blocks.shape[1]), np.bool_)
+    for turned in (0, -samples, samples) if begin[0] < 0 or end[-1] >= samples else (0,):
+        sample = np.arange(turned, turned + samples)
+        first, behind = np.searchsorted(end, sample), np.searchsorted(begin, sample, side="right")
+        hangs |= upto[behind] > upto[first]
     return hangs
 
 

@@ -74,14 +74,14 @@ class Cap(Region):
     def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
         """Which of rows x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
         row = np.clip(rows - self.top, 0, self.height - 1)
-        width = np.where((rows >= self.top) & (rows < self.top + self.height), self.row_width[row], 0)
-        first = (columns[:1] - self.row_left[row]) % self.turn
-        away = columns - columns[:1]
-        inside = away < (width - first)[:, None]
-        for turns in range(1, int((first + away[-1:]).max(initial=0)) // self.turn + 1):
-            begin = turns * self.turn - first
-            inside |= (away >= begin[:, None]) & (away < (begin + width)[:, None])
-        return np.asarray(inside)
+        left, width = self.row_left[row], np.where(row == rows - self.top, self.row_width[row], 0)
+        begin = columns[0] - (columns[0] - left) % self.turn  # of the run round the first column, or left of it
+        turns = self.turn * np.arange((int(columns[-1]) - int(begin.min())) // self.turn + 1)
+        runs = begin[:, None, None] + turns[:, None] + np.stack([np.zeros_like(width), width], axis=1)[:, None]
+        edges = np.searchsorted(columns, runs).reshape(rows.size, -1)
+        lengths = np.diff(edges, axis=1, prepend=0, append=columns.size).ravel()
+        inside = np.repeat(np.arange(lengths.size) % (2 * turns.size + 1) % 2 == 1, lengths)
+        return np.asarray(inside.reshape(rows.size, columns.size))
 
     def touched(self, side: int) -> BoolArray:
         """Which blocks of that rectangle it touches. (rows, columns) bool"""
