@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from node.library import Scan
 from protocol.grid import VOID, BoolArray, ImageArray, IntArray, StepArray
 from protocol.lattice import QUARTERS, Axis
-from protocol.reconstruct import Selection, Window, cut
+from protocol.reconstruct import Selection, Window, cut, every
 
 FILL_CELL = 4
 
@@ -140,23 +140,44 @@ def _cell_means(scan: Scan, selection: Selection) -> ImageArray:
     texels = np.empty((y.border.size - 1, x.border.size - 1, 3), np.uint8)
     texels[core_y, core_x] = core
     for rows in (slice(0, core_y.start), slice(core_y.stop, texels.shape[0])):
-        _fill_skirt(texture.texels, texels, y, x, rows, slice(0, texels.shape[1]))
+        _fill_skirt(texture, texels, y, x, rows, slice(0, texels.shape[1]))
     for columns in (slice(0, core_x.start), slice(core_x.stop, texels.shape[1])):
-        _fill_skirt(texture.texels, texels, y, x, core_y, columns)
+        _fill_skirt(texture, texels, y, x, core_y, columns)
     return texels[_run(y.wanted)][:, _run(x.wanted)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Texture:
-    """A texture, or a strip's own texels of one, and the same at spacings 1, 2, 4, ..., as far as there are."""
+    """A texture of which every stride-th column counts, and the same at spacings 1, 2, 4, ..., as far as there are."""
 
     texels: ImageArray
+    stride: int
     pyramid: tuple[ImageArray, ...]
 
     @classmethod
     def of(cls, scan: Scan, stride: int) -> _Texture:
-        own = scan.texture[:, ::stride]
-        return cls(own, scan.pyramid if stride == 1 else (own,))
+        return cls(scan.texture, stride, scan.pyramid[: None if stride == 1 else 1])
+
+    def crop(self, top: int, height: int, left: int, width: int, level: int = 0) -> ImageArray:
+        """A rectangle of texels that count, at spacing 2^level; cyclic in x, below the last row that row goes on.
+
+        Returns (height, width, 3) uint8.
+        """
+        image, stride = self.pyramid[level], self.stride
+        rows, columns = image.shape[0], image.shape[1] // stride
+        left %= columns
+        if top + height > rows:
+            image = image[np.minimum(np.arange(top, top + height), rows - 1)]
+            top = 0
+        image = image[top : top + height]
+        if left + width <= columns:
+            return np.asarray(every(image, slice(left, left + width), stride))
+        parts = [every(image, slice(left, columns), stride)]
+        width -= columns - left
+        while width > 0:
+            parts.append(every(image, slice(0, min(width, columns)), stride))
+            width -= columns
+        return np.concatenate(parts, axis=1)
 
 
 class _Cells:
@@ -183,22 +204,21 @@ def _plateau_means(texture: _Texture, y: IntArray, x: IntArray, half_spacing: in
     if rows < 1 or columns < 1:
         return np.empty((max(rows, 0), max(columns, 0), 3), np.uint8)
     step = half_spacing // 2
-    height, width = texture.texels.shape[:2]
+    height, width = texture.texels.shape[0], texture.texels.shape[1] // texture.stride
     on_pyramid = half_spacing in (2, 4, 8, 16) and step.bit_length() <= len(texture.pyramid)
     aligned = not (y[0] % half_spacing or x[0] % half_spacing or width % step)
     if on_pyramid and aligned and y[-1] <= 2 * height:
-        level = texture.pyramid[step.bit_length() - 1]
-        return _crop(level, int(y[0]) // half_spacing, rows, int(x[0]) // half_spacing, columns)
+        top, left = int(y[0]) // half_spacing, int(x[0]) // half_spacing
+        return texture.crop(top, rows, left, columns, step.bit_length() - 1)
     even_rows, even_columns = rows + rows % 2, columns + columns % 2  # so that cells of 1.5 texels end on whole ones
-    source = _crop(
-        texture.texels, int(y[0]) // 2, even_rows * half_spacing // 2,
-        int(x[0]) // 2, even_columns * half_spacing // 2,
-    )  # fmt: skip
+    source = texture.crop(
+        int(y[0]) // 2, even_rows * half_spacing // 2, int(x[0]) // 2, even_columns * half_spacing // 2
+    )
     return np.asarray(cv2.resize(source, (even_columns, even_rows), interpolation=cv2.INTER_AREA)[:rows, :columns])
 
 
 def _fill_skirt(
-    texture: ImageArray, texels: ImageArray, y: _Cells, x: _Cells, rows: slice, columns: slice
+    texture: _Texture, texels: ImageArray, y: _Cells, x: _Cells, rows: slice, columns: slice
 ) -> None:
     """Mean colour of the cells in a strip, the narrow direction first. Half-texel borders are taken as whole ones."""
     if rows.start >= rows.stop or columns.start >= columns.stop:
@@ -206,7 +226,7 @@ def _fill_skirt(
     y_border = y.border[rows.start : rows.stop + 1] // 2
     x_border = x.border[columns.start : columns.stop + 1] // 2
     height, width = int(y_border[-1] - y_border[0]), int(x_border[-1] - x_border[0])
-    source = _crop(texture, int(y_border[0]), height, int(x_border[0]), width)
+    source = texture.crop(int(y_border[0]), height, int(x_border[0]), width)
     if rows.stop - rows.start <= columns.stop - columns.start:
         strip = _column_means(_row_means(source, y_border - y_border[0]), x_border - x_border[0])
     else:
@@ -226,20 +246,3 @@ def _row_means(image: ImageArray, border: IntArray) -> ImageArray:
 
 def _column_means(image: ImageArray, border: IntArray) -> ImageArray:
     return np.swapaxes(_row_means(np.swapaxes(image, 0, 1), border), 0, 1)
-
-
-def _crop(image: ImageArray, top: int, height: int, left: int, width: int) -> ImageArray:
-    """A rectangle of an image, cyclic in x; below the last row that row goes on. (height, width, 3) uint8."""
-    rows, columns = image.shape[:2]
-    left %= columns
-    if top + height > rows:
-        image = image[np.minimum(np.arange(top, top + height), rows - 1)]
-        top = 0
-    if left + width <= columns:
-        return image[top : top + height, left : left + width]
-    parts = [image[top : top + height, left:]]
-    width -= columns - left
-    while width > 0:
-        parts.append(image[top : top + height, : min(width, columns)])
-        width -= columns
-    return np.concatenate(parts, axis=1)

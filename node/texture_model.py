@@ -94,17 +94,22 @@ class Expected:
         below = max(rising[0] - wanted, 0) / first if first > 0 else LOSSLESS * float(wanted < rising[0])
         return max(float(np.interp(wanted, rising, self.qualities) + beyond - below), -1.0)
 
-    def _at(self, quality: float, values: FloatArray) -> float:
-        """Linear interpolation, the first and the last slope kept beyond."""
-        beyond = max(quality - self.qualities[-1], 0) * self._last_slope(values)
-        below = min(quality - self.qualities[0], 0) * self._first_slope(values)
-        return float(np.interp(quality, self.qualities, values) + beyond + below)
+    def _at(self, quality: float, values: FloatArray) -> FloatArray:
+        return _continued(quality, self.qualities, values)
 
     def _last_slope(self, values: FloatArray) -> float:
         return float((values[-1] - values[-2]) / (self.qualities[-1] - self.qualities[-2]))
 
     def _first_slope(self, values: FloatArray) -> float:
         return float((values[1] - values[0]) / (self.qualities[1] - self.qualities[0]))
+
+
+def _continued(quality: float | FloatArray, qualities: tuple[int, ...], values: FloatArray) -> FloatArray:
+    """Values at qualities, interpolated linearly, the first and the last slope kept beyond. Of the shape of quality."""
+    first = (values[1] - values[0]) / (qualities[1] - qualities[0])
+    last = (values[-1] - values[-2]) / (qualities[-1] - qualities[-2])
+    beyond, below = np.maximum(quality - qualities[-1], 0) * last, np.minimum(quality - qualities[0], 0) * first
+    return np.asarray(np.interp(quality, qualities, values) + beyond + below)
 
 
 class _Measured:
@@ -207,8 +212,7 @@ def _shifted(qualities: tuple[int, ...], values: FloatArray, by: FloatArray) -> 
     scale = np.array(qualities, np.float64)
     for shift in np.unique(by[by > 0]).tolist():
         known = np.log(np.maximum(values[:, by == shift].sum(axis=1), MSE_MIN))
-        row = Expected(qualities, known, known)
-        total = total + np.array([row.mse(quality) for quality in scale + shift])
+        total = total + np.exp(_continued(scale + shift, qualities, known))
     return np.asarray(total)
 
 
