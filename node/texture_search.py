@@ -83,12 +83,16 @@ class TextureSearch:
         self._quick, self._encodes = quick, encodes
         self._tries = 1 if hurried else TRIES
         self._target_mse = mse_of_db(look.texture_db)
-        self._stride_max = widest_strips(state.shapes[Channel.TEXTURE], region)
         self._lowest, self._highest = quality_bounds(codec)
         self._grain = GRAINS[codec]
         self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
         self.limited = False
         self.mse: float | None = None
+
+    @cached_property
+    def _stride_max(self) -> int:
+        """Of the strips that texture travels in."""
+        return widest_strips(self._state.shapes[Channel.TEXTURE], self._region)
 
     @cached_property
     def _held_mse(self) -> float:

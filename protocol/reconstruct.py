@@ -80,14 +80,17 @@ class Selection:
 
     def adopted_cells(self) -> BoolArray:
         """Which own samples of the windows' rectangle are adopted. (rows, columns) bool, without the column more."""
-        return np.repeat(np.repeat(self.adopted, self.y.size, axis=0), self.x.size, axis=1)
+        return np.repeat(np.repeat(self.adopted, self.x.size, axis=1), self.y.size, axis=0)
 
     def seen_cells(self) -> BoolArray:
         """The same with those that adopted cells hang on, of a patch. (rows, columns) bool."""
-        adopted = self.adopted_cells()
         if not self.x.beyond:
-            return adopted
-        return np.pad(adopted, ((0, 0), (0, 1))) | np.pad(adopted, ((0, 0), (1, 0)))
+            return self.adopted_cells()
+        own = np.repeat(self.adopted, self.x.size, axis=1)
+        seen = np.zeros((own.shape[0], own.shape[1] + self.x.beyond), np.bool_)
+        seen[:, : own.shape[1]] = own
+        seen[:, self.x.beyond :] |= own
+        return np.repeat(seen, self.y.size, axis=0)
 
     def adopted_blocks(self) -> IntArray:
         """Flat indices of the adopted blocks. (n,) int64, in the windows' row order."""
