@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import groupby, pairwise
 
 import numpy as np
 
 from node.state import ClientState
-from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, VOID, BoolArray, ImageArray, IntArray, StepArray
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, VOID, BoolArray, ImageArray, StepArray
 from protocol.lattice import (
     NO_SKIRT,
     RHO_MAX,
@@ -28,7 +29,8 @@ from protocol.rings import ring_strides
 from protocol.strips import Strip, Strips, join_parts, samples_of
 
 FRAME_BYTES = 10  # WebSocket's own, at most
-MERGED_SAMPLES = 2.0
+MERGED_SAMPLES = {Channel.RANGE: 1.5, Channel.TEXTURE: 2.0}
+MERGED_QUICKLY = 1.1  # where time counts as well, which more samples take
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,28 +147,31 @@ def region_lattice(
 
 
 @lru_cache(maxsize=64)
-def widest_strips(shape: ChannelShape, region: Region) -> int:
-    """The largest stride of strips that a region's best travels in: few strips, of at most MERGED_SAMPLES times as many
-    samples. Where strips meet a codec pays for both edges, which costs more than samples that lie a little denser."""
+def widest_strips(shape: ChannelShape, region: Region, quick: bool = False) -> int:
+    """The largest stride of strips that a region's best travels in: few strips, of not many more samples.
+
+    Where strips meet a codec pays for both edges, which costs more than samples that lie a little denser.
+    quick : spare time rather than bytes.
+    """
     if not shape.sphere:
         return STRIDE_MAX
-    touched = region.touched(shape.block)
-    strides = ring_strides(shape.width, shape.height, shape.block)[region.blocks(shape.block)[1] :][: len(touched)]
-    fewest = _samples_in_strips(touched, strides)
-    for stride in STRIDES[STRIDES.index(strides.min()) :]:
-        if _samples_in_strips(touched, np.minimum(strides, stride)) <= MERGED_SAMPLES * fewest:
-            return stride
-    return STRIDE_MAX
+    wide = region.touched(shape.block).sum(axis=1)  # block rows' runs, all round one column
+    strides = ring_strides(shape.width, shape.height, shape.block)[region.blocks(shape.block)[1] :][: wide.size]
+    starts = [0, *(np.flatnonzero(strides[1:] != strides[:-1]) + 1).tolist(), wide.size]
+    strips = [(stop - start, int(wide[start:stop].max()), int(strides[start])) for start, stop in pairwise(starts)]
+    fewest = _samples_in_strips(strips, STRIDE_MAX)
+    least = min(stride for _, _, stride in strips)
+    merged = MERGED_QUICKLY if quick else MERGED_SAMPLES[shape.channel]
+    merging = (stride for stride in STRIDES if stride >= least)
+    return next(stride for stride in merging if _samples_in_strips(strips, stride) <= merged * fewest)
 
 
-def _samples_in_strips(touched: BoolArray, strides: IntArray) -> float:
-    """How many samples strips of these strides have, in blocks of stride 1; the bounds are those of protocol.strips."""
+def _samples_in_strips(strips: list[tuple[int, int, int]], largest: int) -> float:
+    """How many samples strips take whose stride is limited: of (rows, columns, stride) each. [blocks of stride 1]"""
     total = 0.0
-    starts = np.flatnonzero(np.diff(strides, prepend=0))
-    for rows, stride in zip(np.split(touched, starts[1:]), strides[starts].tolist(), strict=True):
-        columns = np.flatnonzero(rows.any(axis=0))
-        gap = np.diff(columns, append=columns[0] + touched.shape[1]).max()
-        total += len(rows) * min(touched.shape[1], touched.shape[1] - int(gap) + 1) / stride
+    for stride, joined in groupby(strips, lambda strip: min(strip[2], largest)):
+        rows, columns, _ = zip(*joined, strict=True)
+        total += sum(rows) * max(columns) / stride
     return total
 
 

@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 
 from node.coded import Coded, Part, own_inside
 from node.library import Scan
-from node.refine_range import (
-    PERCENTILE,
-    code_range_lattice,
-    note_range,
-    range_lattice,
-)
+from node.range_model import PERCENTILE
+from node.refine_range import code_range_lattice, note_range, range_lattice
 from node.state import ClientState
-from protocol.grid import RANGE_BLOCK, VOID, BoolArray
+from protocol.grid import RANGE_BLOCK, VOID, BoolArray, FloatArray
 from protocol.holdings import COARSE_RANK, range_rank
 from protocol.lattice import Channel, ChannelShape, mask_to_runs
 from protocol.messages import RangeParameters
@@ -34,6 +30,7 @@ from protocol.strips import blocks_of
 LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
 TRIES_MAX = 4
 FEW_CELLS = 1  # too far off in a block that counts as good
+SLACK = 1e-6  # of sums of areas
 
 
 def reach_range(
@@ -69,11 +66,11 @@ def reach_range(
     after = state.copy()
     if coded is not None:
         note_range(scan, after, coded, target_steps)
-    poor = after.cells_beyond(target_steps, region)
+    poor = after.cells_beyond(target_steps, region) * _block_area(region)
     if poor[kept].sum() + beyond <= allowed:
         return first
     worst = _worst(poor, allowed)
-    second = _mend(scan, after, region, wanted, target_steps, worst, allowed - int(poor[~worst].sum()))
+    second = _mend(scan, after, region, wanted, target_steps, worst, allowed - float(poor[~worst].sum()))
     return [*first, second] if second is not None else first
 
 
@@ -84,11 +81,11 @@ def _mend(
     wanted: RangeParameters,
     target_steps: float,
     poor: BoolArray,
-    allowed: int,
+    allowed: float,
 ) -> Coded | None:
     """Encode the poor blocks again: at the spacing wanted where that makes them good enough, else at spacing 1.
 
-    allowed : how many of their cells may still be too far off.
+    allowed : how many of their cells may still be too far off, by area.
     """
     held = state.holdings.channels[Channel.RANGE]
     rank, level = (_of_region(array, region)[poor] for array in (held.rank, held.level))
@@ -103,12 +100,12 @@ def _mend(
     return _code_listed(scan, state, region, RangeParameters(1, quantum, None), ~poor)
 
 
-def _worst(beyond: NDArray[np.int64], allowed: int) -> BoolArray:
-    """The fewest blocks without which no more than `allowed` cells are too far off."""
+def _worst(beyond: FloatArray, allowed: float) -> BoolArray:
+    """The fewest blocks without which no more than `allowed` cells are too far off, by area."""
     order = np.argsort(beyond, axis=None)[::-1]
     left = beyond.sum() - np.cumsum(beyond.ravel()[order])
     worst = np.zeros(beyond.size, np.bool_)
-    worst[order[: int(np.argmax(left <= allowed)) + 1]] = True
+    worst[order[: int(np.argmax(left <= allowed + SLACK)) + 1]] = True
     return worst.reshape(beyond.shape)
 
 
@@ -135,27 +132,34 @@ def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:
     return adopted
 
 
-def _allowed_beyond(scan: Scan, region: Region) -> int:
-    """How many measured cells of a region may be further off than its target (99th percentile, "higher")."""
+def _allowed_beyond(scan: Scan, region: Region) -> float:
+    """How many measured cells of a region may be further off than its target, by area (99th percentile, "higher")."""
     rows = np.arange(region.top, region.top + region.height)
     inside = region.inside(rows, np.arange(scan.spec.width))
-    measured = int(np.count_nonzero(inside & (scan.range_steps[region.rows] != VOID)))
-    return max(measured - 1, 0) * (100 - PERCENTILE) // 100
+    measured = np.count_nonzero(inside & (scan.range_steps[region.rows] != VOID), axis=1)
+    return max(float(measured @ region.sample_area(rows)) - 1, 0) * (100 - PERCENTILE) / 100
 
 
-def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps: float) -> int:
-    """How many of a region's cells a refinement leaves further off than target_steps."""
+def _block_area(region: Region) -> FloatArray:
+    """How large a cell is in each row of blocks that a region touches. (rows, 1)"""
+    _, top, _, high = region.blocks(RANGE_BLOCK)
+    return region.sample_area(RANGE_BLOCK * np.arange(top, top + high) + RANGE_BLOCK // 2)[:, None]
+
+
+def _cells_beyond(scan: Scan, coded: Coded | None, region: Region, target_steps: float) -> float:
+    """How many of a region's cells a refinement leaves further off than target_steps, by area."""
     return sum(_part_beyond(scan, part, region, target_steps) for part in coded.parts) if coded is not None else 0
 
 
-def _part_beyond(scan: Scan, part: Part, region: Region, target_steps: float) -> int:
+def _part_beyond(scan: Scan, part: Part, region: Region, target_steps: float) -> float:
     """The same of a strip. An own sample counts for the cells up to the next one too."""
     selection, inside = part.selection, own_inside(region, part.selection)
     own = slice(0, inside.shape[1])
     truth = np.asarray(cut(scan.range_steps, selection), np.int32)[:, own]
     far = np.abs(part.range_steps[:, own].astype(np.int32) - truth) > target_steps
     far &= (truth != VOID) & selection.adopted_cells() & inside
-    return selection.lattice.shape.stride * int(np.count_nonzero(far))
+    area = region.sample_area(selection.y.start + np.arange(len(far)))
+    return selection.lattice.shape.stride * float(np.count_nonzero(far, axis=1) @ area)
 
 
 def _of_region(blocks: NDArray[Any], region: Region) -> NDArray[Any]:

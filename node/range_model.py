@@ -1,66 +1,119 @@
 """What range interpolated between every second, fourth and eighth sample misses, cell by cell: measured once a scan.
 
-So a look knows before any trial which spacing will do at its place, and about which quantum. Of cylinders alone: on a
-sphere samples stand apart as far as their row says.
+So a look knows before any trial which spacing will do at its place, and about which quantum. On a sphere the rows near
+a pole are measured several times, as their samples may stand as far apart as their own do, or as those of other rows.
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.grid import VOID, GridSpec, StepArray
+from protocol.grid import RANGE_BLOCK, VOID, FloatArray, GridSpec, IntArray, StepArray
+from protocol.lattice import STRIDE_MAX, STRIDES
 from protocol.region import Region
+from protocol.rings import ring_strides
 
 SPACINGS = (2, 4, 8)
 PERCENTILE = 99
 AN_OCTAVE = 15  # codes of errors, which end at 16 octaves
 UNMEASURED = 255
 BAND_ROWS = 256
+_SLACK = 1e-6  # so that no rounding of weights decides
+
+
+def percentile_of(counts: FloatArray | IntArray) -> int:
+    """99th percentile ("higher") of values 0, 1, 2 ..., each counted or weighed: one sample weighs 1 on the equator."""
+    upto = np.cumsum(counts)
+    total = float(upto[-1]) if upto.size else 0.0
+    wanted = min((total - 1) * PERCENTILE / 100 + 1, total)
+    return int(np.searchsorted(upto, wanted - _SLACK)) if total else 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Some rows' errors, every stride-th cell.  row : (n,) int64 ascending.  codes : (n, W / stride)"""
+
+    row: IntArray
+    codes: NDArray[np.uint8]
 
 
 class RangeModel:
-    """Errors of range that is interpolated and not quantised. Memory: a byte for each cell and spacing.
+    """Errors of range that is interpolated and not quantised. Memory: a byte for each cell and spacing, a third more
+    on a sphere.
 
     range_steps, filled : as of node.library.Scan.
     """
 
     def __init__(self, spec: GridSpec, range_steps: StepArray, filled: StepArray) -> None:
-        within = spec.width if spec.geometry == "cylinder" else 0
-        self._codes = {p: _error_codes(range_steps, filled, p) for p in SPACINGS if within and not within % p}
+        self._known: dict[tuple[int, int], _Rows] = {}  # by spacing, and how far apart a row's samples are
+        self._strides: dict[int, IntArray] = {}
+        for p in (p for p in SPACINGS if not spec.width % p):
+            self._strides[p] = strides = _strides(spec, p)
+            for stride in (stride for stride in STRIDES if stride <= strides.max()):
+                rows = np.flatnonzero(strides >= stride)
+                self._known[p, stride] = _Rows(rows, _error_codes(range_steps, filled, rows, p, stride))
 
     @property
     def knows(self) -> bool:
         """Whether it can say anything of its scan."""
-        return bool(self._codes)
+        return bool(self._known)
 
-    def error(self, region: Region, p: int) -> float:
-        """99th percentile of the error over a region's measured cells, 5% too high at most; infinite where unknown."""
-        if p == 1 or p not in self._codes:
-            return 0.0 if p == 1 else math.inf
-        counts = np.bincount(self._codes[p][region.rows][:, region.columns].ravel(), minlength=UNMEASURED + 1)
-        upto = np.cumsum(counts[:UNMEASURED])
-        if not upto[-1]:
+    def error(self, region: Region, p: int, stride_max: int = STRIDE_MAX) -> float:
+        """99th percentile of the error over a region's measured cells, 5% too high at most; infinite where unknown.
+
+        stride_max : of the strips that a sphere's range travels in. Cells are weighed by their area.
+        """
+        if p == 1 or p not in self._strides:
+            return 0.0 if p == 1 else np.inf
+        rows = np.arange(region.top, region.top + region.height)
+        strides = np.minimum(self._strides[p][rows], stride_max)
+        counts = np.zeros(UNMEASURED + 1)
+        for stride in np.unique(strides).tolist():
+            known, wanted = self._known[p, stride], rows[strides == stride]
+            first = region.left // stride
+            columns = np.arange(first, first + -(-region.width // stride))
+            place = np.searchsorted(known.row, wanted)
+            codes = known.codes[place].take(columns % known.codes.shape[1], axis=1)
+            counts += _counted(codes, region, wanted, columns * stride) * stride
+        if not counts[:UNMEASURED].any():
             return 0.0
-        wanted = math.ceil((upto[-1] - 1) * PERCENTILE / 100) + 1
-        return float(2 ** (int(np.searchsorted(upto, wanted)) / AN_OCTAVE) - 1)
+        return float(2 ** (percentile_of(counts[:UNMEASURED]) / AN_OCTAVE) - 1)
 
 
-def _error_codes(range_steps: StepArray, filled: StepArray, p: int) -> NDArray[np.uint8]:
-    """ceil(15 log2(1 + error)) of each cell; UNMEASURED where it is void. (H, W)"""
-    codes = np.empty(range_steps.shape, np.uint8)
-    height = range_steps.shape[0]
-    for top in range(0, height, BAND_ROWS):
-        rows = np.arange(top, min(top + BAND_ROWS, height))
-        low = rows // p * p
+def _strides(spec: GridSpec, p: int) -> IntArray:
+    """How far apart the samples of each row stand at most at a spacing. (H,) [columns]"""
+    if spec.geometry != "sphere":
+        return np.ones(spec.height, np.int64)
+    return ring_strides(spec.width, spec.height, RANGE_BLOCK, 2 * p).repeat(RANGE_BLOCK)[: spec.height]
+
+
+def _counted(codes: NDArray[np.uint8], region: Region, rows: IntArray, columns: IntArray) -> FloatArray:
+    """How often each code stands in a region, by area. (256,)"""
+    inside, area = region.inside(rows, columns), region.sample_area(rows)
+    if inside.all() and (area == 1).all():
+        return np.bincount(codes.ravel(), minlength=UNMEASURED + 1).astype(np.float64)
+    weight = np.repeat(area, np.count_nonzero(inside, axis=1))
+    return np.asarray(np.bincount(codes[inside], weight, minlength=UNMEASURED + 1), np.float64)
+
+
+def _error_codes(
+    range_steps: StepArray, filled: StepArray, rows: IntArray, p: int, stride: int
+) -> NDArray[np.uint8]:
+    """ceil(15 log2(1 + error)) of some rows' cells; UNMEASURED where one is void. (n, W / stride)"""
+    height, width = range_steps.shape
+    codes = np.empty((rows.size, width // stride), np.uint8)
+    for done in range(0, rows.size, BAND_ROWS):
+        band = slice(done, done + BAND_ROWS)
+        low = rows[band] // p * p
         high = np.minimum(low + p, height - 1)
-        part = ((rows - low) / np.maximum(high - low, 1))[:, None].astype(np.float32)
-        above, below = (_along(np.asarray(filled[row]), p) for row in (low, high))
-        truth = np.asarray(range_steps[rows])
+        part = ((rows[band] - low) / np.maximum(high - low, 1))[:, None].astype(np.float32)
+        above, below = (_along(np.asarray(filled[row][:, ::stride]), p) for row in (low, high))
+        truth = np.asarray(range_steps[rows[band]][:, ::stride])
         error = np.abs(above + (below - above) * part - truth)
-        codes[rows] = np.where(truth == VOID, UNMEASURED, np.ceil(AN_OCTAVE * np.log2(1 + error)))
+        codes[band] = np.where(truth == VOID, UNMEASURED, np.ceil(AN_OCTAVE * np.log2(1 + error)))
     return codes
 
 

@@ -7,9 +7,11 @@ Source: REQUIREMENTS F-14b, E-01.
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
-from node.coded import Coded
+from node.coded import Coded, widest_strips
 from node.library import Scan
 from node.quality import Encodes
 from node.range_bitmaps import reach_range
@@ -25,6 +27,7 @@ from node.refine_range import (
     trial_of,
 )
 from node.state import ClientState
+from protocol.lattice import Channel
 from protocol.messages import Look, RangeParameters
 from protocol.region import Region
 
@@ -157,7 +160,10 @@ class RangeSearch:
         """Error of a spacing that is not quantised. [steps]"""
         assert self._model is not None  # else nobody asks
         if p not in self._errors:
-            self._errors[p] = self._model.error(self._region, p)
+            shape = self._state.shapes[Channel.RANGE]
+            finer = p * p < 1 << shape.coarse_level  # than the first view: else nobody would adopt it
+            stride_max = widest_strips(shape, self._region)
+            self._errors[p] = self._model.error(self._region, p, stride_max) if finer else math.inf
         return self._errors[p]
 
     def _trial(self, p: int) -> Trial | None:

@@ -14,20 +14,20 @@ import numpy as np
 
 from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of, widest_strips
 from node.library import Scan
+from node.range_model import percentile_of
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
 from protocol.codec_lift import Survey, encode_and_decode
-from protocol.grid import RANGE_BLOCK, VOID, IntArray
+from protocol.grid import RANGE_BLOCK, VOID, FloatArray, IntArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
-from protocol.lattice import NO_SKIRT, STRIDE_MAX, Channel, Lattice, Parameters
+from protocol.lattice import NO_SKIRT, Channel, Lattice, Parameters
 from protocol.messages import RangeParameters
 from protocol.reconstruct import Selection, content_hashes, cut, range_patch
 from protocol.region import Region
 from protocol.strips import LENGTH, Strip, Strips, build_strips, join_parts, select_strips
 
 SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
-PERCENTILE = 99
 QUANTUM_MAX = 4096
 FINENESS_COSTS = 0.35  # blocks held at a small quantum can only be made finer at one as small (F-09c)
 TRIES_MAX = 6  # quanta tried at a spacing
@@ -88,7 +88,7 @@ def code_range(
 ) -> Coded | None:
     """Encode a refinement of the region's blocks, or None when the client holds all of it already.
 
-    quick : spare time rather than bytes, on a sphere in strips of own samples only.
+    quick : spare time rather than bytes.
     Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
     Raises LatticeError for a spacing that does not fit the scan.
     """
@@ -143,8 +143,8 @@ def _surveyed(scan: Scan, selection: Selection, quantum: int) -> float:
 
 
 def range_lattice(state: ClientState, region: Region, wanted: RangeParameters, *, merged: bool = True) -> Parameters:
-    """The lattice of a region's blocks; merged : of a sphere in as few strips as pays."""
-    stride = widest_strips(state.shapes[Channel.RANGE], region) if merged else STRIDE_MAX
+    """The lattice of a region's blocks; merged : of a sphere in as few strips as saves bytes, else as saves time."""
+    stride = widest_strips(state.shapes[Channel.RANGE], region, quick=not merged)
     return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho_of(wanted.s), stride)
 
 
@@ -180,10 +180,13 @@ class Trial:
         self._errors: dict[int, float] = {}
 
     def error(self, quantum: int) -> float:
-        """99th percentile ("higher") of the error over measured own samples of the region. [steps]"""
+        """99th percentile ("higher") of the error over measured samples of the region, by area. [steps]"""
         if quantum not in self._errors:
-            error = np.concatenate([part.error(quantum) for part in self._parts])
-            self._errors[quantum] = percentile_higher(error, PERCENTILE) if error.size else 0.0
+            counts = [part.errors(quantum) for part in self._parts]
+            total = np.zeros(max(each.size for each in counts))
+            for each in counts:
+                total[: each.size] += each
+            self._errors[quantum] = float(percentile_of(total))
         return self._errors[quantum]
 
     def expected_bytes(self, quantum: int) -> float:
@@ -203,13 +206,15 @@ class _TrialPart:
         truth = np.asarray(cut(scan.range_steps, selection))[self._crop]
         self._counts = inside[self._crop] & (truth != VOID)
         self._truth = truth[self._counts].astype(np.int32)
+        area = selection.lattice.shape.stride * region.sample_area(selection.y.start + rows)
+        self._weight = None if (area == 1).all() else np.repeat(area, np.count_nonzero(self._counts, axis=1))
         self._surveys: dict[int, Survey] = {}
 
-    def error(self, quantum: int) -> IntArray:
-        """Error of every measured own sample in the region. [steps]"""
+    def errors(self, quantum: int) -> FloatArray | IntArray:
+        """How many measured samples in the region are off by 0, 1, 2 ... steps, each weighed by its area."""
         samples = self._samples if quantum == 1 else self.survey(quantum).decoded
         patch = range_patch(self._selection, samples)[self._crop]
-        return np.asarray(np.abs(patch[self._counts].astype(np.int32) - self._truth))
+        return np.bincount(np.abs(patch[self._counts].astype(np.int32) - self._truth), self._weight)
 
     def survey(self, quantum: int) -> Survey:
         """What the strip would take."""
@@ -221,11 +226,6 @@ class _TrialPart:
 def _around(places: IntArray) -> slice:
     """From the first to the last of ascending places."""
     return slice(int(places[0]), int(places[-1]) + 1) if places.size else slice(0, 0)
-
-
-def percentile_higher(values: np.ndarray, percent: float) -> float:
-    """Percentile of a non-empty array, the next higher value where it falls between two."""
-    return float(np.percentile(values, percent, method="higher"))
 
 
 def _best_held(held: ChannelHoldings, lattice: Lattice) -> int:

@@ -18,7 +18,7 @@ from node.texture_model import SPACINGS, TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
 from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
 from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
-from protocol.lattice import STRIDE_MAX, Channel, ChannelShape, Lattice, Parameters, mask_to_runs
+from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, mask_to_runs
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
@@ -113,8 +113,8 @@ def _best_needed(state: ClientState, parameters: Parameters, quality: int) -> in
 def texture_lattice(
     state: ClientState, region: Region, wanted: TextureParameters, *, merged: bool = True
 ) -> Parameters:
-    """The lattice of a region's blocks; merged : of a sphere in as few strips as pays."""
-    stride = widest_strips(state.shapes[Channel.TEXTURE], region) if merged else STRIDE_MAX
+    """The lattice of a region's blocks; merged : of a sphere in as few strips as saves bytes, else as saves time."""
+    stride = widest_strips(state.shapes[Channel.TEXTURE], region, quick=not merged)
     return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s), stride)
 
 

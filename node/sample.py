@@ -106,8 +106,8 @@ def _smoothed(texels: ImageArray, seen: BoolArray) -> ImageArray:
     known, share = np.zeros((*whole, 3), np.uint8), np.zeros(whole, np.uint8)
     cv2.copyTo(np.ascontiguousarray(texels), mask, known[:height, :width])
     share[:height, :width] = mask * np.uint8(255)
-    total, share = (_quartered(image).astype(np.float32) for image in (known, share))
-    means = np.clip(_means(total, share / 255), 0, 255).astype(np.uint8)
+    total, seen_share = (_quartered(image).astype(np.float32) for image in (known, share))
+    means = np.clip(_means(total, seen_share / np.float32(255)), 0, 255).astype(np.uint8)
     filled = cv2.resize(means, whole[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
     cv2.copyTo(known[:height, :width], mask, filled)
     return np.asarray(filled, np.uint8)

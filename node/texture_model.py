@@ -174,9 +174,9 @@ class TextureModel:
         left, top, wide, high = region.blocks(CELL)
         rows, columns = slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
         among = region.touched(CELL) if among is None else among
-        counted = among.astype(np.float64)
+        counted = among.astype(np.float32)
         content, mse = (
-            np.einsum("qrc,rc->qr", values[:, rows][:, :, columns], counted)
+            np.einsum("qrc,rc->qr", values[:, rows].take(columns, axis=2), counted).astype(np.float64)
             for values in (measured.content, measured.mse)
         )
         mse *= self._area[rows]

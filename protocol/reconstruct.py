@@ -248,19 +248,25 @@ def _fill_between(patch: ImageArray, texels: ImageArray, y: Window, x: Window, r
 def _enlarged(y: Window, x: Window, texels: ImageArray) -> ImageArray | None:
     """The same where every cell is as large, 2, 4 or 8 texels: what image libraries do at once. Else None."""
     p = int(x.whole[0]) // QUARTERS
-    top, left = _first_texel(y, p), _first_texel(x, p)
-    if p not in (2, 4, 8) or top is None or left is None:
+    if p not in (2, 4, 8):
+        return None
+    low = x.low
+    if x.high[-1] < x.low[-1]:  # all round: the last column goes before the first one, the first behind the last
+        texels = np.concatenate([texels[:, -1:], texels, texels[:, :1]], axis=1)
+        low = np.where(np.arange(low.size) < np.argmin(low), 0, low + 1)
+    top, left = _first_texel(y, y.low, p, y.sample.size), _first_texel(x, low, p, texels.shape[1])
+    if top is None or left is None:
         return None
     size = texels.shape[1] * p, texels.shape[0] * p
     whole = cv2.resize(texels, size, interpolation=cv2.INTER_LINEAR_EXACT)
     return np.asarray(whole[top : top + y.low.size, left : left + x.low.size])
 
 
-def _first_texel(window: Window, p: int) -> int | None:
+def _first_texel(window: Window, low: IntArray, p: int, samples: int) -> int | None:
     """Where an axis' positions begin in its samples enlarged p times, if they follow each other there."""
-    place = 2 * p * window.low + 2 * p * window.part // window.whole + p - 1
-    regular = (window.whole == QUARTERS * p).all() and (np.diff(place) == 2).all() and (window.low < window.high).all()
-    inside = regular and place[0] >= 0 and place[0] % 2 == 0 and place[-1] // 2 < p * window.sample.size
+    place = 2 * p * low + 2 * p * window.part // window.whole + p - 1
+    regular = (window.whole == QUARTERS * p).all() and (np.diff(place) == 2).all() and (window.low != window.high).all()
+    inside = regular and place[0] >= 0 and place[0] % 2 == 0 and place[-1] // 2 < p * samples
     return int(place[0]) // 2 if inside else None
 
 

@@ -36,6 +36,10 @@ class Region:
         """How many samples it holds, at the density of the middle."""
         return self.width * self.height
 
+    def sample_area(self, rows: IntArray) -> FloatArray:
+        """How large a sample of each of its rows (n,) is. (n,), 1 in the middle of the grid"""
+        return np.ones(rows.size)
+
     def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
         """Which of rows x columns (not wrapped) lie in it. (rows, columns) bool"""
         down = (rows >= self.top) & (rows < self.top + self.height)
@@ -70,6 +74,10 @@ class Cap(Region):
     def area(self) -> float:
         """How many samples it holds, at the density of the equator."""
         return float(self.row_width @ self.row_share)
+
+    def sample_area(self, rows: IntArray) -> FloatArray:
+        """How large a sample of each row is, 1 on the equator; of rows outside, as large as of the nearest inside."""
+        return self.row_share[np.clip(rows - self.top, 0, self.height - 1)]
 
     def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
         """Which of rows x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""

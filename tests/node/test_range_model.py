@@ -1,20 +1,24 @@
 """What is known of range before any trial."""
 
-from pathlib import Path
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from node.coded import widest_strips
 from node.first_view import build_first_view
 from node.library import Scan
 from node.quality import Encodes
-from node.range_model import SPACINGS, RangeModel
+from node.range_model import SPACINGS, RangeModel, percentile_of
 from node.range_search import RangeSearch
 from node.refine_range import trial_of
 from protocol.grid import Grid, GridSpec
+from protocol.lattice import Channel
 from protocol.messages import Look
 from protocol.region import region_round
-from protocol.sphere import region_on
+from protocol.rings import thin_grid
+from protocol.sphere import DirectionGrid, click_of, region_on, vectors
 from tests.node.scans import keep, make_grid
 
 
@@ -45,17 +49,67 @@ def test_what_cannot_be_and_what_nobody_measured() -> None:
     assert unknown.error(region, 4) == 0
 
 
-def test_a_closed_object_is_sampled_as_far_apart_as_its_shape_allows(tmp_path: Path) -> None:
-    """Of a sphere nothing is known beforehand, so every spacing is tried."""
-    grid = make_grid(voids=False)
-    spec = GridSpec(160, 96, 640, 384, 0.02, 2.0, 0.0, geometry="sphere")
-    row = np.linspace(-1, 1, 96)[:, None]
-    steps = np.rint((60 + 5 * np.cos(row) + np.zeros(160)) / spec.step_mm).astype(np.uint16)
-    sphere = keep(Grid(spec, steps, grid.texture), tmp_path)
-    state = build_first_view(sphere, "htj2k", 32768).state
-    region = region_on(spec, 0.5, 0.5, 0.05, spec.width, spec.height)
-    look = Look(1, 0.5, 0.5, range_mm=0.1)
-    known = RangeModel(spec, sphere.range_steps, sphere.filled)
+def test_a_spacing_as_coarse_as_the_first_view_is_never_chosen(scan: Scan) -> None:
+    plain = replace(scan, range_steps=np.full_like(scan.range_steps, 3000), filled=np.full_like(scan.filled, 3000))
+    state = build_first_view(scan, "htj2k", 32768).state
+    region = region_round(0.5, 0.5, 0.05, scan.spec.width, scan.spec.height)
+    known = RangeModel(scan.spec, plain.range_steps, plain.filled)
+    assert known.error(region, 8) == 0 and trial_of(plain, state, region, 8) is None
     for hurried in (False, True):
-        search = RangeSearch(sphere, state, look, region, known, hurried, Encodes(lambda: False))
-        assert search.choose(search.target_steps).p > 1
+        search = RangeSearch(plain, state, Look(1, 0.5, 0.5), region, known, hurried, Encodes(lambda: False))
+        assert search.choose(50.0).p == 4
+
+
+# -- closed objects ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """A lumpy object, as seen by direction."""
+    spec = GridSpec(320, 192, 640, 384, 0.005, 1.0, 0.0, geometry="sphere")
+    grid = DirectionGrid(spec.width, spec.height)
+    row, column = np.mgrid[: spec.height, : spec.width]
+    x, y, z = np.moveaxis(vectors(grid.theta_v(row), grid.theta_h(column)), -1, 0)
+    steps = np.rint((60 + np.sin(5 * x + 1) * np.cos(4 * y) + 0.6 * np.sin(5 * z - 3 * x)) / spec.step_mm)
+    texture = make_grid(voids=False).texture
+    kept = thin_grid(Grid(spec, steps.astype(np.uint16), texture))
+    return keep(kept, tmp_path_factory.mktemp("closed"))
+
+
+@pytest.mark.parametrize("theta_v", [0.0, 0.3, 0.8, math.pi / 2, math.pi])
+def test_it_says_of_a_sphere_what_a_trial_would_find(sphere: Scan, theta_v: float) -> None:
+    spec = sphere.spec
+    model = RangeModel(spec, sphere.range_steps, sphere.filled)
+    state = build_first_view(sphere, "htj2k", 32768).state
+    region = region_on(spec, *click_of(theta_v, 1.0), 0.05, spec.width, spec.height)
+    stride_max = widest_strips(state.shapes[Channel.RANGE], region)
+    trials = {p: trial for p in SPACINGS if (trial := trial_of(sphere, state, region, p)) is not None}
+    assert 2 in trials and 4 in trials
+    for p, trial in trials.items():  # samples may begin elsewhere than those of the whole rows
+        assert 0.8 * trial.error(1) - 1 <= model.error(region, p, stride_max) <= 1.25 * trial.error(1) + 2
+
+
+def test_a_closed_object_is_sampled_as_far_apart_as_its_shape_allows(sphere: Scan) -> None:
+    state = build_first_view(sphere, "htj2k", 32768).state
+    known = RangeModel(sphere.spec, sphere.range_steps, sphere.filled)
+    for v in (0.0, 0.1, 0.5):
+        region = region_on(sphere.spec, 0.5, v, 0.05, sphere.spec.width, sphere.spec.height)
+        chosen = [
+            RangeSearch(sphere, state, Look(1, 0.5, v, range_mm=0.3), region, model, hurried, Encodes(lambda: False))
+            .choose(60.0)
+            .p
+            for model, hurried in ((None, False), (known, False), (known, True))
+        ]
+        assert chosen[0] == chosen[1] > 1 and chosen[2] > 1
+
+
+@pytest.mark.parametrize("counts", [[98, 1, 1], [990, 0, 10], [991, 0, 9], [0, 1], [3, 0, 2]])
+def test_counted_values_have_the_percentile_that_they_have_one_by_one(counts: list[int]) -> None:
+    values = np.repeat(np.arange(len(counts)), counts)
+    assert percentile_of(np.array(counts)) == np.percentile(values, 99, method="higher")
+
+
+def test_weighed_values_count_by_their_area() -> None:
+    assert percentile_of(np.array([500.0, 400.0, 8.0])) == 1  # as near a pole, where a thousand samples have little
+    assert percentile_of(np.zeros(3)) == percentile_of(np.zeros(0)) == 0
+    assert percentile_of(np.array([0.0, 0.2])) == 1
