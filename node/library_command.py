@@ -295,6 +295,8 @@ def _line(scan: ScanSummary) -> str:
     s = scan.spec
     made = datetime.fromtimestamp(scan.about.created_unix_s).isoformat(" ", "minutes")
     shape = f"{s.width} x {s.height} + {s.texture_width} x {s.texture_height}"
+    if s.geometry != "cylinder":
+        shape += f" {s.geometry}"
     return f"{scan.id}  {made}  {shape}  {printable(scan.about.name)}".rstrip()
 
 

@@ -1,6 +1,7 @@
 import argparse
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from protocol.errors import LibraryError
 from protocol.grid import Grid, GridSpec
 
 SPEC = GridSpec(16, 8, 32, 16, step_mm=0.05, pitch_mm=1.0)
+SAMPLES = np.ones((8, 16), np.uint16), np.zeros((16, 32, 3), np.uint8)
 
 
 def run(*arguments: object) -> int:
@@ -56,6 +58,15 @@ def test_list_shows_scans_newest_first_and_what_else_is_there(folder: Path, caps
     first, second, third = capsys.readouterr().out.splitlines()
     assert first.endswith("16 x 8 + 32 x 16  scan 1") and second.endswith("knee")
     assert third == "holiday: not a scan; left alone"
+
+
+def test_list_tells_closed_objects_from_others(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    library = Library(folder)
+    library.add(Grid(replace(SPEC, geometry="sphere"), *SAMPLES), About(1e9, name="stone"))
+    library.close()
+    run("list", "--library", folder)
+    first, second, _ = capsys.readouterr().out.splitlines()
+    assert first.endswith("16 x 8 + 32 x 16 sphere  stone") and "sphere" not in second
 
 
 def test_a_name_cannot_steer_the_terminal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
