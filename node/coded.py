@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import groupby, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from protocol.lattice import (
     NO_SKIRT,
     RHO_MAX,
     RHO_ONE,
-    STRIDE_MAX,
+    STRIDE_SETS,
     STRIDES,
     Channel,
     ChannelShape,
@@ -30,6 +31,7 @@ from protocol.strips import Strip, Strips, join_parts, samples_of
 
 FRAME_BYTES = 10  # WebSocket's own, at most
 MERGED_SAMPLES = {Channel.RANGE: 1.5, Channel.TEXTURE: 2.0}
+DENSER_MAX = 2  # along a row than across
 MERGED_QUICKLY = 1.1  # where time counts as well, which more samples take
 
 
@@ -136,43 +138,52 @@ def rho_of(s: float | None) -> int:
 
 
 def region_lattice(
-    region: Region, channel: Channel, half_spacing: int, rho: int = NO_SKIRT, stride_max: int = STRIDE_MAX
+    region: Region, channel: Channel, half_spacing: int, rho: int = NO_SKIRT, strides: tuple[int, ...] = STRIDES
 ) -> Parameters:
     """The lattice of the blocks that a region touches; of a cap they are listed, and it has no skirt."""
     side = RANGE_BLOCK if channel is Channel.RANGE else TEXTURE_BLOCK
     touched = region.touched(side)
     if touched.all():
-        return Parameters(half_spacing, *region.blocks(side), rho, rho, stride_max=stride_max)
-    return Parameters(half_spacing, *region.blocks(side), listed=mask_to_runs(touched), stride_max=stride_max)
+        return Parameters(half_spacing, *region.blocks(side), rho, rho, strides=strides)
+    return Parameters(half_spacing, *region.blocks(side), listed=mask_to_runs(touched), strides=strides)
 
 
 @lru_cache(maxsize=64)
-def widest_strips(shape: ChannelShape, region: Region, quick: bool = False) -> int:
-    """The largest stride of strips that a region's best travels in: few strips, of not many more samples.
+def fewest_strips(shape: ChannelShape, region: Region, quick: bool = False) -> tuple[int, ...]:
+    """The strides of strips that a region's best travels in: few strips, of not many more samples.
 
-    Where strips meet a codec pays for both edges, which costs more than samples that lie a little denser.
-    quick : spare time rather than bytes.
+    Where strips meet a codec pays for both edges, which costs more than samples that lie a little denser. Samples much
+    denser along rows than across would show as spokes round a pole.   quick : spare time rather than bytes.
     """
     if not shape.sphere:
-        return STRIDE_MAX
+        return STRIDES
     wide = region.touched(shape.block).sum(axis=1)  # block rows' runs, all round one column
-    strides = ring_strides(shape.width, shape.height, shape.block)[region.blocks(shape.block)[1] :][: wide.size]
-    starts = [0, *(np.flatnonzero(strides[1:] != strides[:-1]) + 1).tolist(), wide.size]
-    strips = [(stop - start, int(wide[start:stop].max()), int(strides[start])) for start, stop in pairwise(starts)]
-    fewest = _samples_in_strips(strips, STRIDE_MAX)
-    least = min(stride for _, _, stride in strips)
-    merged = MERGED_QUICKLY if quick else MERGED_SAMPLES[shape.channel]
-    merging = (stride for stride in STRIDES if stride >= least)
-    return next(stride for stride in merging if _samples_in_strips(strips, stride) <= merged * fewest)
+    own = ring_strides(shape.width, shape.height, shape.block)[region.blocks(shape.block)[1] :][: wide.size]
+    starts = [0, *(np.flatnonzero(own[1:] != own[:-1]) + 1).tolist(), wide.size]
+    rows = [_Rows(stop - start, int(wide[start:stop].max()), int(own[start])) for start, stop in pairwise(starts)]
+    most = (MERGED_QUICKLY if quick else MERGED_SAMPLES[shape.channel]) * _strips_of(rows, STRIDES)[1]
+    offers = [(*_strips_of(rows, strides), strides) for strides in STRIDE_SETS]
+    return min((count, samples, strides) for count, samples, strides in offers if samples <= most)[2]
 
 
-def _samples_in_strips(strips: list[tuple[int, int, int]], largest: int) -> float:
-    """How many samples strips take whose stride is limited: of (rows, columns, stride) each. [blocks of stride 1]"""
-    total = 0.0
-    for stride, joined in groupby(strips, lambda strip: min(strip[2], largest)):
-        rows, columns, _ = zip(*joined, strict=True)
-        total += sum(rows) * max(columns) / stride
-    return total
+class _Rows(NamedTuple):
+    """Rows of blocks of one stride: how many, and how many columns a region touches in them."""
+
+    high: int
+    wide: int
+    own: int
+
+
+def _strips_of(rows: list[_Rows], strides: tuple[int, ...]) -> tuple[int, float]:
+    """How many strips rows make with some strides, and their samples in blocks of stride 1; infinite: too dense."""
+    count, samples = 0, 0.0
+    for stride, joined in groupby(rows, lambda part: max(stride for stride in strides if stride <= part.own)):
+        parts = list(joined)
+        if max(part.own for part in parts) > DENSER_MAX * stride:
+            return count, math.inf
+        count += 1
+        samples += sum(part.high for part in parts) * max(part.wide for part in parts) / stride
+    return count, samples
 
 
 def own_inside(region: Region, selection: Selection) -> BoolArray:

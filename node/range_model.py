@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.grid import RANGE_BLOCK, VOID, FloatArray, GridSpec, IntArray, StepArray
-from protocol.lattice import STRIDE_MAX, STRIDES
+from protocol.lattice import STRIDES
 from protocol.region import Region
-from protocol.rings import ring_strides
+from protocol.rings import limited_strides, ring_strides
 
 SPACINGS = (2, 4, 8)
 PERCENTILE = 99
@@ -61,18 +61,18 @@ class RangeModel:
         """Whether it can say anything of its scan."""
         return bool(self._known)
 
-    def error(self, region: Region, p: int, stride_max: int = STRIDE_MAX) -> float:
+    def error(self, region: Region, p: int, strides: tuple[int, ...] = STRIDES) -> float:
         """99th percentile of the error over a region's measured cells, 5% too high at most; infinite where unknown.
 
-        stride_max : of the strips that a sphere's range travels in. Cells are weighed by their area.
+        strides : of the strips that a sphere's range travels in. Cells are weighed by their area.
         """
         if p == 1 or p not in self._strides:
             return 0.0 if p == 1 else np.inf
         rows = np.arange(region.top, region.top + region.height)
-        strides = np.minimum(self._strides[p][rows], stride_max)
+        sent = limited_strides(self._strides[p][rows], strides)
         counts = np.zeros(UNMEASURED + 1)
-        for stride in np.unique(strides).tolist():
-            known, wanted = self._known[p, stride], rows[strides == stride]
+        for stride in np.unique(sent).tolist():
+            known, wanted = self._known[p, stride], rows[sent == stride]
             first = region.left // stride
             columns = np.arange(first, first + -(-region.width // stride))
             place = np.searchsorted(known.row, wanted)

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of, widest_strips
+from node.coded import Coded, Part, fewest_strips, framed, message_overhead, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.range_model import percentile_of
 from node.sample import range_samples, void_cells
@@ -77,8 +77,8 @@ def trial_of(scan: Scan, state: ClientState, region: Region, p: int) -> Trial | 
     if scan.spec.width % p:
         return None
     fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
-    stride = widest_strips(fresh.shape, region)
-    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p, NO_SKIRT, stride))
+    strides = fewest_strips(fresh.shape, region)
+    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p, NO_SKIRT, strides))
     strips = select_strips(lattices, fresh, range_rank(1))
     return Trial(scan, strips, region) if strips else None
 
@@ -144,8 +144,8 @@ def _surveyed(scan: Scan, selection: Selection, quantum: int) -> float:
 
 def range_lattice(state: ClientState, region: Region, wanted: RangeParameters, *, merged: bool = True) -> Parameters:
     """The lattice of a region's blocks; merged : of a sphere in as few strips as saves bytes, else as saves time."""
-    stride = widest_strips(state.shapes[Channel.RANGE], region, quick=not merged)
-    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho_of(wanted.s), stride)
+    strides = fewest_strips(state.shapes[Channel.RANGE], region, quick=not merged)
+    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho_of(wanted.s), strides)
 
 
 def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from node.coded import Coded, Part, own_inside, region_lattice, rho_of, widest_strips
+from node.coded import Coded, Part, fewest_strips, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
@@ -114,8 +114,8 @@ def texture_lattice(
     state: ClientState, region: Region, wanted: TextureParameters, *, merged: bool = True
 ) -> Parameters:
     """The lattice of a region's blocks; merged : of a sphere in as few strips as saves bytes, else as saves time."""
-    stride = widest_strips(state.shapes[Channel.TEXTURE], region, quick=not merged)
-    return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s), stride)
+    strides = fewest_strips(state.shapes[Channel.TEXTURE], region, quick=not merged)
+    return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s), strides)
 
 
 def note_texture(scan: Scan, state: ClientState, coded: Coded) -> None:

@@ -27,9 +27,9 @@ from protocol.codec import (
     encode_texture,
 )
 from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray
-from protocol.lattice import STRIDE_MAX
+from protocol.lattice import STRIDES
 from protocol.region import Region
-from protocol.rings import ring_strides
+from protocol.rings import limited_strides, ring_strides
 
 QUALITIES = {
     TextureCodec.HTJ2K: (6, 20, 34, 48, 62),
@@ -163,12 +163,12 @@ class TextureModel:
         codec: TextureCodec,
         p: int = 1,
         among: BoolArray | None = None,
-        stride_max: int = STRIDE_MAX,
+        strides: tuple[int, ...] = STRIDES,
     ) -> Expected:
         """What the blocks that a region touches will take and reach at a spacing, or those among them.
 
         p : one of SPACINGS.   among : (rows, columns) of Region.blocks, bool; None: all that it touches.
-        stride_max : of the strips that they travel in.
+        strides : of the strips that they travel in.
         """
         measured = self._measured[codec, p]
         left, top, wide, high = region.blocks(CELL)
@@ -181,7 +181,7 @@ class TextureModel:
         )
         mse *= self._area[rows]
         area = self._area[rows] @ among.sum(axis=1)
-        sent = np.minimum(self._stride[rows], stride_max)
+        sent = limited_strides(self._stride[rows], strides)
         denser = STRETCHED * np.log2(self._stride[rows] / sent)
         content, mse = (_shifted(measured.qualities, values, denser) for values in (content, mse))
         images = 1 + np.count_nonzero(np.diff(sent))

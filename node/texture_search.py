@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from node.coded import Coded, framed, message_overhead, widest_strips
+from node.coded import Coded, fewest_strips, framed, message_overhead
 from node.library import Scan
 from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
@@ -90,9 +90,9 @@ class TextureSearch:
         self.mse: float | None = None
 
     @cached_property
-    def _stride_max(self) -> int:
+    def _strides(self) -> tuple[int, ...]:
         """Of the strips that texture travels in."""
-        return widest_strips(self._state.shapes[Channel.TEXTURE], self._region)
+        return fewest_strips(self._state.shapes[Channel.TEXTURE], self._region)
 
     @cached_property
     def _held_mse(self) -> float:
@@ -156,13 +156,13 @@ class TextureSearch:
             return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
         touched = self._region.touched(TEXTURE_BLOCK)
         among = touched if listed is None else self._blocks(listed)
-        expected = self._model.expect(self._region, CODECS[self._codec], p, among, self._stride_max)
+        expected = self._model.expect(self._region, CODECS[self._codec], p, among, self._strides)
         needed = quality_needed(self._state, self._region, p)
         adopted = among & (needed <= expected.quality_for_mse(MARGIN * self._target_mse))
         if not adopted.any():
             adopted = among
         if adopted.sum() < among.sum():
-            expected = self._model.expect(self._region, CODECS[self._codec], p, adopted, self._stride_max)
+            expected = self._model.expect(self._region, CODECS[self._codec], p, adopted, self._strides)
         if adopted.sum() == touched.sum():
             return expected
         kept_error, kept = self._held_error(~adopted & touched)
@@ -291,6 +291,6 @@ class TextureSearch:
         if self._model is not None and self._look.alpha is None:
             codec = CODECS[self._codec]
             sent = self._region.touched(TEXTURE_BLOCK) & ~left_alone(self._state, coded, self._region)
-            expected = self._model.expect(self._region, codec, p, sent, self._stride_max)
+            expected = self._model.expect(self._region, codec, p, sent, self._strides)
             self._model.learn(codec, p, expected.size_bytes(coded.quality), len(coded.payload))
             self._known.clear()

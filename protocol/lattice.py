@@ -22,8 +22,9 @@ QUARTERS = 4
 RHO_ONE = 1 << 16
 RHO_MAX = 1 << 20
 NO_SKIRT = 0
-STRIDE_MAX = TEXTURE_BLOCK
-STRIDES = (1, 2, 4, 8, STRIDE_MAX)
+STRIDES = (1, 2, 4, 8, 16)
+# Those that a refinement may allow its strips, as they are numbered on the wire: all, or few for fewer strips.
+STRIDE_SETS = (STRIDES, (1,), (1, 2), (1, 2, 4), (1, 2, 4, 8), (1, 2, 8), (1, 4, 16))
 LEVEL_MAX = 40
 _LEVEL_BOUNDS = (QUARTERS * QUARTERS) * (1 << np.arange(LEVEL_MAX, dtype=np.int64))
 
@@ -117,8 +118,8 @@ class Parameters:
     block_x, block_y, blocks_wide, blocks_high : the plateau, in blocks; it may wrap in x, not in y.
     rho_x, rho_y : growth of the skirt's steps, round(65536 exp(1/S')), 65536..2^20; 0 for no skirt.
     listed : None, or run lengths over the plateau's blocks in row order, unlisted first: only listed ones are adopted.
-    stride_max : on a sphere, the most columns from one sample of a strip to the next, a power of two: the fewer, the
-    fewer and wider strips (protocol.strips). STRIDE_MAX everywhere else.
+    strides : on a sphere, how many columns apart the samples of a strip may stand, one of STRIDE_SETS: the fewer of
+    these, the fewer and wider strips (protocol.strips). STRIDES everywhere else.
     """
 
     half_spacing: int
@@ -129,7 +130,7 @@ class Parameters:
     rho_x: int = NO_SKIRT
     rho_y: int = NO_SKIRT
     listed: tuple[int, ...] | None = None
-    stride_max: int = STRIDE_MAX
+    strides: tuple[int, ...] = STRIDES
 
     @property
     def spacing(self) -> float:
@@ -235,8 +236,8 @@ def check_parameters(shape: ChannelShape, p: Parameters) -> None:
         raise LatticeError(f"rho must be {NO_SKIRT} or between {RHO_ONE} and {RHO_MAX}")
     if shape.channel is Channel.RANGE and 2 * shape.width % p.half_spacing:
         raise LatticeError(f"spacing {p.spacing} does not divide the {shape.width} columns")
-    if p.stride_max not in (STRIDES if shape.sphere else (STRIDE_MAX,)):
-        raise LatticeError(f"a largest stride of {p.stride_max} does not fit the scan")
+    if p.strides not in (STRIDE_SETS if shape.sphere else (STRIDES,)):
+        raise LatticeError(f"strips with strides of {p.strides} do not fit the scan")
     if p.blocks_wide == columns and (p.block_x or 2 * shape.width % p.half_spacing):
         raise LatticeError("a plateau all round must start at block 0 and its spacing divide the width")
 

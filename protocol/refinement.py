@@ -14,7 +14,7 @@ from functools import lru_cache
 
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
-from protocol.lattice import STRIDE_MAX, Channel, Parameters
+from protocol.lattice import STRIDE_SETS, Channel, Parameters
 from protocol.sphere_fovea import SphereParameters
 
 MAGIC = 0x5246
@@ -133,22 +133,23 @@ def unpack_parameters(data: bytes) -> Parameters:
         raise RemoteWireError("lattice parameters are cut short")
     runs = _varints(data[PARAMETERS.size :])
     spacing, x, y, wide, high, rho_x, rho_y = PARAMETERS.unpack_from(data)
-    half_spacing, stride_max = from_spacing_byte(spacing)
-    return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, runs or None, stride_max)
+    half_spacing, strides = from_spacing_byte(spacing)
+    return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, runs or None, strides)
 
 
 def spacing_byte(p: Parameters) -> int:
-    """Half spacing, and in the upper three bits one more than the exponent of the largest stride, 0 for no limit."""
+    """Half spacing, and in the upper three bits which of STRIDE_SETS strips may have."""
     if p.half_spacing >> SPACING_BITS:
         raise LocalWireError(f"a spacing of {p.spacing} does not travel")
-    exponent = 0 if p.stride_max == STRIDE_MAX else p.stride_max.bit_length()
-    return p.half_spacing | exponent << SPACING_BITS
+    if p.strides not in STRIDE_SETS:
+        raise LocalWireError(f"strides of {p.strides} do not travel")
+    return p.half_spacing | STRIDE_SETS.index(p.strides) << SPACING_BITS
 
 
-def from_spacing_byte(spacing: int) -> tuple[int, int]:
-    """Inverse of spacing_byte: half spacing and largest stride."""
-    half_spacing, exponent = spacing % (1 << SPACING_BITS), spacing >> SPACING_BITS
-    return half_spacing, 1 << exponent - 1 if exponent else STRIDE_MAX
+def from_spacing_byte(spacing: int) -> tuple[int, tuple[int, ...]]:
+    """Inverse of spacing_byte: half spacing and strides; none where their number means nothing."""
+    half_spacing, number = spacing % (1 << SPACING_BITS), spacing >> SPACING_BITS
+    return half_spacing, STRIDE_SETS[number] if number < len(STRIDE_SETS) else ()
 
 
 def _read_header(data: bytes) -> tuple[Generator, Channel, int, int, int, int, int, int, int, tuple[int, int, int]]:

@@ -42,6 +42,12 @@ def ring_strides(width: int, height: int, side: int = RANGE_BLOCK, half_spacing:
     return stride
 
 
+def limited_strides(own: IntArray, allowed: tuple[int, ...]) -> IntArray:
+    """Of each stride the largest one allowed that is no larger. own : (n,) int64.  allowed : ascending, from 1."""
+    strides = np.array(allowed, np.int64)
+    return np.asarray(strides[np.searchsorted(strides, own, side="right") - 1])
+
+
 def widened(own: Cells, stride: int) -> Cells:
     """Own samples and the cells between them: (rows, n + 1, ...) to (rows, n stride, ...), the last one only looked at.
 

@@ -31,7 +31,7 @@ from protocol.lattice import (
     runs_to_mask,
 )
 from protocol.reconstruct import Selection, select
-from protocol.rings import ring_strides
+from protocol.rings import limited_strides, ring_strides
 
 LENGTH = struct.Struct("<I")
 
@@ -60,7 +60,7 @@ def build_strips(shape: ChannelShape, parameters: Parameters) -> tuple[Lattice, 
     own, fitting = (
         ring_strides(shape.width, shape.height, shape.block, half)[y.block] for half in (2, parameters.half_spacing)
     )
-    stride = np.minimum(fitting, parameters.stride_max)
+    stride = limited_strides(fitting, parameters.strides)
     first = np.flatnonzero(np.diff(stride, prepend=0))
     strips = []
     for begin, end in zip(first.tolist(), [*first[1:].tolist(), stride.size], strict=True):

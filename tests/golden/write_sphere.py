@@ -28,7 +28,7 @@ from protocol import codec_lift
 from protocol.codec import RangeCodec, encode_mask
 from protocol.grid import VOID
 from protocol.holdings import Holdings, mix32, range_rank, texture_rank
-from protocol.lattice import Channel, ChannelShape, Parameters
+from protocol.lattice import STRIDE_SETS, Channel, ChannelShape, Parameters
 from protocol.reconstruct import Selection, content_hashes, cut, paste, range_patch, texture_patch
 from protocol.refinement import Generator, Refinement
 from protocol.rings import ring_strides, thin_rings
@@ -58,8 +58,10 @@ STRIDES = [
     (4096, 2048, 16, 2), (4096, 2048, 16, 6), (36, 40, 8, 2), (7, 9, 8, 2),
 ]  # fmt: skip
 RANGES = [
-    (Parameters(4, 0, 0, 8, 6, listed=(*BESIDE_THE_POLE, 8), stride_max=2), 7),
-    (Parameters(2, 0, 11, 8, 6, stride_max=1), 9),
+    (Parameters(4, 0, 0, 8, 17, strides=(1, 2, 8)), 12),
+    (Parameters(4, 0, 0, 8, 6, listed=(*BESIDE_THE_POLE, 8), strides=(1, 2)), 7),
+    (Parameters(2, 0, 11, 8, 6, strides=(1,)), 9),
+    (Parameters(2, 0, 2, 8, 4, strides=(1, 4, 16)), 9),
     (Parameters(2, 0, 0, 8, 3), 1),
     (Parameters(2, 0, 0, 8, 5, listed=BESIDE_THE_POLE), 1),
     (Parameters(4, 6, 9, 4, 8, listed=4 * (1, 2, 1, 4)), 3),
@@ -73,8 +75,10 @@ TEXTURES = [
     (Parameters(2, 3, 5, 2, 4, listed=(0, 3, 1, 1, 1, 2)), 60),
     (Parameters(4, 0, 0, 4, 9), 60),
     (Parameters(3, 1, 6, 2, 3, RHO_E, RHO_E), 40),
-    (Parameters(2, 3, 0, 2, 5, listed=(0, 3, 1, 1, 1, 2, 2), stride_max=1), 60),
-    (Parameters(4, 0, 0, 4, 9, stride_max=2), 60),
+    (Parameters(2, 3, 0, 2, 5, listed=(0, 3, 1, 1, 1, 2, 2), strides=(1,)), 60),
+    (Parameters(4, 0, 0, 4, 9, strides=(1, 2)), 60),
+    (Parameters(2, 0, 0, 4, 9, strides=(1, 2, 8)), 60),
+    (Parameters(4, 0, 0, 4, 9, strides=(1, 4, 16)), 60),
 ]
 
 
@@ -197,7 +201,7 @@ def _parameters(p: Parameters) -> dict[str, Any]:
     return {
         "halfSpacing": p.half_spacing, "blockX": p.block_x, "blockY": p.block_y, "blocksWide": p.blocks_wide,
         "blocksHigh": p.blocks_high, "rhoX": p.rho_x, "rhoY": p.rho_y,
-        "listed": None if p.listed is None else list(p.listed), "strideMax": p.stride_max,
+        "listed": None if p.listed is None else list(p.listed), "strides": STRIDE_SETS.index(p.strides),
     }  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from node.coded import widest_strips
+from node.coded import fewest_strips
 from node.first_view import build_first_view
 from node.library import Scan
 from node.quality import Encodes
@@ -82,11 +82,11 @@ def test_it_says_of_a_sphere_what_a_trial_would_find(sphere: Scan, theta_v: floa
     model = RangeModel(spec, sphere.range_steps, sphere.filled)
     state = build_first_view(sphere, "htj2k", 32768).state
     region = region_on(spec, *click_of(theta_v, 1.0), 0.05, spec.width, spec.height)
-    stride_max = widest_strips(state.shapes[Channel.RANGE], region)
+    strides = fewest_strips(state.shapes[Channel.RANGE], region)
     trials = {p: trial for p in SPACINGS if (trial := trial_of(sphere, state, region, p)) is not None}
     assert 2 in trials and 4 in trials
     for p, trial in trials.items():  # samples may begin elsewhere than those of the whole rows
-        assert 0.8 * trial.error(1) - 1 <= model.error(region, p, stride_max) <= 1.25 * trial.error(1) + 2
+        assert 0.8 * trial.error(1) - 1 <= model.error(region, p, strides) <= 1.25 * trial.error(1) + 2
 
 
 def test_a_closed_object_is_sampled_as_far_apart_as_its_shape_allows(sphere: Scan) -> None:

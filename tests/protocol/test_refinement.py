@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
-from protocol.lattice import NO_SKIRT, STRIDES, Channel, Parameters
+from protocol.lattice import NO_SKIRT, STRIDE_SETS, Channel, Parameters
 from protocol.refinement import (
     CRC,
     HEADER,
@@ -24,7 +24,7 @@ from protocol.refinement import (
 U16, U32 = st.integers(0, 0xFFFF), st.integers(0, 0xFFFFFFFF)
 RUNS = st.none() | st.lists(st.integers(0, 2**35 - 1), min_size=1, max_size=20).map(tuple)
 PARAMETERS = st.builds(
-    Parameters, st.integers(0, 31), U16, U16, U16, U16, U32, U32, RUNS, st.sampled_from(STRIDES)
+    Parameters, st.integers(0, 31), U16, U16, U16, U16, U32, U32, RUNS, st.sampled_from(STRIDE_SETS)
 )
 REFINEMENTS = st.builds(
     Refinement,
@@ -160,6 +160,7 @@ def test_parameters_cut_short_are_refused(size: int) -> None:
         Parameters(2, -1, 0, 1, 1),
         Parameters(2, 70000, 0, 1, 1),
         Parameters(256, 0, 0, 1, 1),
+        Parameters(2, 0, 0, 1, 1, strides=(1, 8)),
         Parameters(2, 0, 0, 1, 1, 2**32),
         Parameters(2, 0, 0, 1, 1, listed=()),
         Parameters(2, 0, 0, 1, 1, listed=(-1, 2)),

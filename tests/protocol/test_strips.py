@@ -15,7 +15,7 @@ from protocol.codec_lift import decode, encode_and_decode
 from protocol.errors import CodecError, LatticeError
 from protocol.grid import VOID, BoolArray, StepArray
 from protocol.holdings import ChannelHoldings, range_rank, texture_rank
-from protocol.lattice import STRIDES, Channel, ChannelShape, Parameters, build_lattice, mask_to_runs
+from protocol.lattice import STRIDE_SETS, STRIDES, Channel, ChannelShape, Parameters, build_lattice, mask_to_runs
 from protocol.reconstruct import Selection, cut, paste, range_patch, select, texture_patch
 from protocol.rings import ring_strides, thin_rings, thin_texture
 from protocol.strips import blocks_of, build_strips, join_parts, samples_of, select_strips, split_parts
@@ -37,8 +37,8 @@ def windows(draw: st.DrawFn, shape: ChannelShape = SHAPE, skirts: bool = True) -
     if draw(st.booleans()):
         random = np.random.default_rng(draw(st.integers(0, 999)))
         listed = mask_to_runs(random.random((high, wide)) < draw(st.sampled_from([0.1, 0.5, 0.9])))
-    half = draw(st.sampled_from([2, 4, 8]))
-    return Parameters(half, block_x, block_y, wide, high, draw(rho), draw(rho), listed, draw(st.sampled_from(STRIDES)))
+    half, strides = draw(st.sampled_from([2, 4, 8])), draw(st.sampled_from(STRIDE_SETS))
+    return Parameters(half, block_x, block_y, wide, high, draw(rho), draw(rho), listed, strides)
 
 
 def surface(seed: int = 1, voids: float = 0.0) -> StepArray:
@@ -80,7 +80,7 @@ def test_no_block_is_covered_twice_and_listed_ones_are(parameters: Parameters) -
         covered[np.ix_(lattice.y.block, lattice.x.block)] += 1
         may[np.ix_(lattice.y.block, lattice.x.block)] |= lattice.listed
         strides = ring_strides(96, 184, 8, parameters.half_spacing)[lattice.y.block]
-        assert (np.minimum(strides, parameters.stride_max) == lattice.shape.stride).all()
+        assert all(max(s for s in parameters.strides if s <= own) == lattice.shape.stride for own in strides)
     assert covered.max(initial=0) <= 1
     assert np.array_equal(wanted(parameters) & (covered > 0), wanted(parameters))
     if parameters.listed is not None:
@@ -108,7 +108,7 @@ def test_a_strip_is_no_wider_than_what_is_listed_in_it(parameters: Parameters) -
 
 @given(windows(), st.integers(0, 3), st.sampled_from([0.0, 0.1]))
 def test_exact_windows_are_the_scans_and_nothing_else_changes(p: Parameters, seed: int, voids: float) -> None:
-    exact = Parameters(2, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, 0, 0, p.listed, p.stride_max)
+    exact = Parameters(2, p.block_x, p.block_y, p.blocks_wide, p.blocks_high, 0, 0, p.listed, p.strides)
     scan, dense, held = surface(seed, voids), np.full((184, 96), 7, np.uint16), ChannelHoldings.coarse(SHAPE)
     refine(dense, held, scan, exact)
     np.testing.assert_array_equal(held.level == 0, wanted(exact))
@@ -246,12 +246,23 @@ def test_blocks_of_strips_are_each_named_once(parameters: Parameters) -> None:
     assert np.unique(blocks).size == blocks.size
 
 
-def test_a_largest_stride_joins_strips_and_only_on_a_sphere() -> None:
+@pytest.mark.parametrize(
+    ("allowed", "strides"),
+    [
+        (STRIDES, [8, 4, 2, 1, 2, 4, 8]),
+        ((1, 2), [2, 1, 2]),
+        ((1,), [1]),
+        ((1, 2, 8), [8, 2, 1, 2, 8]),
+        ((1, 4, 16), [4, 1, 4]),
+    ],
+)
+def test_few_strides_join_strips(allowed: tuple[int, ...], strides: list[int]) -> None:
+    strips = build_strips(SHAPE, Parameters(2, 0, 0, 12, 23, strides=allowed))
+    assert [lattice.shape.stride for lattice in strips] == strides
+
+
+def test_strides_are_chosen_on_a_sphere_alone_and_of_those_that_travel() -> None:
     whole = Parameters(2, 0, 0, 12, 23)
-    for most, strides in {16: [8, 4, 2, 1, 2, 4, 8], 2: [2, 1, 2], 1: [1]}.items():
-        strips = build_strips(SHAPE, replace(whole, stride_max=most))
-        assert [lattice.shape.stride for lattice in strips] == strides
-    with pytest.raises(LatticeError, match="largest stride of 3"):
-        build_strips(SHAPE, replace(whole, stride_max=3))
-    with pytest.raises(LatticeError, match="largest stride of 2"):
-        build_strips(replace(SHAPE, sphere=False), replace(whole, stride_max=2))
+    for shape, strides in ((SHAPE, (1, 8)), (SHAPE, ()), (replace(SHAPE, sphere=False), (1, 2))):
+        with pytest.raises(LatticeError, match="strides of"):
+            build_strips(shape, replace(whole, strides=strides))

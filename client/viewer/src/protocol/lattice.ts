@@ -9,7 +9,8 @@ export type Channel = typeof RANGE | typeof TEXTURE;
 export const CHANNELS: readonly Channel[] = [RANGE, TEXTURE];
 
 export const QUARTERS = 4;
-export const STRIDE_MAX = 16;
+/** How many columns apart the samples of a strip may stand, by the number on the wire: STRIDE_SETS of protocol/lattice.py. */
+export const STRIDE_SETS = [[1, 2, 4, 8, 16], [1], [1, 2], [1, 2, 4], [1, 2, 4, 8], [1, 2, 8], [1, 4, 16]];
 const RHO_ONE = 1 << 16;
 const RHO_MAX = 1 << 20;
 const HALF_SPACINGS: Record<Channel, readonly number[]> = { [RANGE]: [2, 4, 8, 16], [TEXTURE]: [2, 3, 4, 6, 8, 12, 16] };
@@ -39,8 +40,8 @@ export interface Parameters {
   rhoX: number;
   rhoY: number;
   listed: number[] | null;
-  /** On a sphere the largest stride of its strips; STRIDE_MAX, which is no limit, if it is not said. */
-  strideMax?: number;
+  /** On a sphere which of STRIDE_SETS its strips may have; 0, all of them, if it is not said. */
+  strides?: number;
 }
 
 /** One axis of a lattice: positions, the samples that stand there, and the blocks it covers. */
@@ -131,7 +132,7 @@ export function checkParameters(shape: ChannelShape, p: Parameters): void {
     p.blockX >= 0 && p.blockX < columns && p.blocksWide >= 1 && p.blocksWide <= columns &&
     p.blockY >= 0 && p.blocksHigh >= 1 && p.blockY + p.blocksHigh <= rows &&
     rhoFits(p.rhoX) && rhoFits(p.rhoY) &&
-    [...(shape.sphere ? [1, 2, 4, 8] : []), STRIDE_MAX].includes(p.strideMax ?? STRIDE_MAX) &&
+    (p.strides ?? 0) < (shape.sphere ? STRIDE_SETS.length : 1) &&
     (shape.channel === TEXTURE || divides) &&
     (p.blocksWide < columns || (p.blockX === 0 && divides));
   if (!fits) throw new RemoteWireError(`no lattice: ${JSON.stringify(p)}`);

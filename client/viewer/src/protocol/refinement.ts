@@ -62,7 +62,7 @@ export function parseRefinement(data: Uint8Array): Refinement {
   };
 }
 
-const limit = (exponent: number): { strideMax?: number } => (exponent ? { strideMax: 2 ** (exponent - 1) } : {});
+const allowed = (strides: number): { strides?: number } => (strides ? { strides } : {});
 
 /** Lattice parameters as they travel. Throws RemoteWireError when the bytes are not whole. */
 export function parseParameters(data: Uint8Array): Parameters {
@@ -70,7 +70,7 @@ export function parseParameters(data: Uint8Array): Parameters {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const u16 = (at: number) => view.getUint16(at, true);
   return {
-    halfSpacing: view.getUint8(0) & 31, ...limit(view.getUint8(0) >> 5), blockX: u16(1), blockY: u16(3), blocksWide: u16(5), blocksHigh: u16(7),
+    halfSpacing: view.getUint8(0) & 31, ...allowed(view.getUint8(0) >> 5), blockX: u16(1), blockY: u16(3), blocksWide: u16(5), blocksHigh: u16(7),
     rhoX: view.getUint32(9, true), rhoY: view.getUint32(13, true),
     listed: data.length > PARAMETERS_BYTES ? parseVarints(data.subarray(PARAMETERS_BYTES), 5) : null,
   };

@@ -4,7 +4,7 @@
 import { RemoteWireError } from './errors.ts';
 import type { ChannelHoldings } from './holdings.ts';
 import {
-  STRIDE_MAX, axisX, axisY, blockSide, blocksAcross, buildLattice, checkParameters, latticeOf, runsToMask,
+  STRIDE_SETS, axisX, axisY, blockSide, blocksAcross, buildLattice, checkParameters, latticeOf, runsToMask,
 } from './lattice.ts';
 import type { Axis, ChannelShape, Lattice, Parameters } from './lattice.ts';
 import { select, selectionSamples } from './reconstruct.ts';
@@ -19,7 +19,8 @@ export function buildStrips(shape: ChannelShape, p: Parameters): Lattice[] {
   checkParameters(shape, p);
   const y = axisY(shape, p);
   const [owns, strides] = [2, p.halfSpacing].map((half) => ringStrides(shape.width, shape.height, blockSide(shape), half));
-  const strideOf = (block: number) => Math.min(strides![block]!, p.strideMax ?? STRIDE_MAX);
+  const allowed = STRIDE_SETS[p.strides ?? 0]!;
+  const strideOf = (block: number) => allowed.findLast((stride) => stride <= strides![block]!)!;
   const strips: Lattice[] = [];
   for (let begin = 0, end = 0; begin < y.block.length; begin = end) {
     const stride = strideOf(y.block[begin]!);
