@@ -25,6 +25,7 @@ RANGE_SPACING_MIN = 8
 TEXTURE_SPACING_MIN = 4
 BYTES_PER_RANGE_CELL = 4
 BYTES_PER_TEXEL = 1
+SLACK = 1e-9  # so that no machine's sine decides
 
 Array = TypeVar("Array", StepArray, ImageArray)
 
@@ -72,6 +73,8 @@ def build_coarse(grid: Grid, first_view_bytes: int = FIRST_VIEW_BYTES) -> Coarse
     texels = coarse_shape(s.texture_height, s.texture_width, TEXTURE_SPACING_MIN, first_view_bytes // BYTES_PER_TEXEL)
     range_steps = average_range(grid.range_steps, *cells)
     texture = average_texture(grid.texture, grid.range_steps != VOID, *texels)
+    if s.geometry == "sphere":
+        range_steps, texture = evened(range_steps), evened(texture)
     return Coarse(s, _read_only(range_steps), fill_voids(range_steps), _read_only(texture))
 
 
@@ -122,6 +125,30 @@ def average_texture(texture: ImageArray, measured: BoolArray, rows: int, columns
             total = np.where(area == 0, _cell_sums(texels, band, columns), total)
         means[row] = _rounded(total, np.where(area == 0, height * width, area))
     return means
+
+
+def evened(cells: Array) -> Array:
+    """Cells of directions, with those of rows near a pole averaged along them over as much as a row is high.
+
+    There they are wedges, narrow and long; what differs from one to the next would be seen as spokes.
+    cells : (h, w) uint16, voids left out and left void, or (h, w, 3) uint8.
+    """
+    rows, columns = cells.shape[:2]
+    narrow = columns / (2 * rows * np.sin(np.pi * (np.arange(rows) + 0.5) / rows))  # cells as wide as a row is high
+    averaged = np.array(cells)
+    for row, half in enumerate(np.floor((narrow - 1) / 2 + SLACK).astype(np.int64).tolist()):
+        if half > 0:
+            line = cells[row].reshape(columns, -1).astype(np.int64)
+            seen = (line != VOID).any(axis=1, keepdims=True).astype(np.int64) if cells.ndim == 2 else np.ones_like(line)
+            total, count = _sums_round(line, half), _sums_round(seen, half)
+            averaged[row] = np.where(seen > 0, _rounded(total, np.maximum(count, 1)), VOID).reshape(cells[row].shape)
+    return averaged
+
+
+def _sums_round(line: IntArray, half: int) -> IntArray:
+    """Sum over each value of a circle and `half` on either side. (w, n) int64"""
+    upto = np.cumsum(np.concatenate([np.zeros_like(line[:1]), line[-half:], line, line[:half]]), axis=0)
+    return np.asarray(upto[2 * half + 1 :] - upto[: -2 * half - 1])
 
 
 def fill_voids(range_steps: StepArray) -> StepArray:

@@ -1,3 +1,5 @@
+import math
+from dataclasses import replace
 from fractions import Fraction
 from math import lcm
 
@@ -13,9 +15,10 @@ from node.coarse import (
     build_coarse,
     build_pyramid,
     coarse_shape,
+    evened,
     fill_voids,
 )
-from protocol.grid import BoolArray, Grid, GridSpec, StepArray
+from protocol.grid import VOID, BoolArray, Grid, GridSpec, StepArray
 
 SIZES = {"S": (100, 360, 256, 1024), "M": (1024, 1440, 2048, 4096), "L": (2048, 4096, 4096, 8192)}
 
@@ -204,3 +207,44 @@ def test_what_is_derived_is_read_only_and_the_grid_is_left_as_it_was() -> None:
     assert not any(array.flags.writeable for array in images)
     assert grid.range_steps.flags.writeable and grid.texture.flags.writeable
     assert np.array_equal(grid.range_steps, before[0]) and np.array_equal(grid.texture, before[1])
+
+
+# -- spheres -----------------------------------------------------------------------------------------------------------
+
+
+def test_cells_of_short_rows_are_averaged_as_far_as_a_row_is_high() -> None:
+    random = np.random.default_rng(4)
+    cells = random.integers(1, 60000, (32, 64)).astype(np.uint16)
+    averaged = evened(cells)
+    np.testing.assert_array_equal(averaged[10:22], cells[10:22])  # there a cell is as wide as high
+    for row in range(32):
+        wide = 1 / math.sin(math.pi * (row + 0.5) / 32)
+        half = math.floor((wide - 1) / 2)
+        column = random.integers(64)
+        around = cells[row, np.arange(column - half, column + half + 1) % 64].astype(int)
+        assert averaged[row, column] == int(around.mean() + 0.5)
+    assert np.ptp(averaged[0].astype(int)) < np.ptp(cells[0].astype(int)) / 2
+
+
+def test_what_is_averaged_stays_void_and_takes_nothing_from_voids() -> None:
+    cells = np.full((32, 64), 500, np.uint16)
+    cells[:3, 10:40] = VOID
+    np.testing.assert_array_equal(evened(cells), cells)
+
+
+def test_a_turned_sphere_has_its_first_view_turned() -> None:
+    random = np.random.default_rng(5)
+    texture = random.integers(0, 256, (32, 64, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(evened(np.roll(texture, 7, axis=1)), np.roll(evened(texture), 7, axis=1))
+    assert evened(texture)[0].std() < texture[0].std() / 2
+
+
+def test_only_a_spheres_first_view_is_averaged() -> None:
+    random = np.random.default_rng(6)
+    texture = random.integers(0, 256, (128, 256, 3)).astype(np.uint8)
+    steps = np.full((64, 128), 3000, np.uint16)
+    spec = GridSpec(128, 64, 256, 128, 0.02, 1.0)
+    cylinder = build_coarse(Grid(spec, steps, texture)).texture
+    sphere = build_coarse(Grid(replace(spec, geometry="sphere"), steps, texture)).texture
+    np.testing.assert_array_equal(sphere, evened(cylinder))
+    assert not np.array_equal(sphere[0], cylinder[0])

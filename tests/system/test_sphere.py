@@ -8,6 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import aiohttp
@@ -119,13 +120,19 @@ def left_in_cap(
     model: Model, true_mm: NDArray[np.floating[Any]], theta_v: float, theta_h: float
 ) -> tuple[FloatArray, FloatArray]:
     """How far off the model is in the window round a direction, and each sample's solid angle. (n,) [mm], (n,)"""
-    height, width = true_mm.shape
+    inside, area = cap_of(true_mm.shape, theta_v, theta_h)
+    return np.abs(model.range_mm - true_mm)[inside], area
+
+
+@lru_cache(maxsize=8)
+def cap_of(shape: tuple[int, int], theta_v: float, theta_h: float) -> tuple[BoolArray, FloatArray]:
+    """Which dense directions are in the window round one, and the solid angles of those. (H, W), (n,)"""
+    height, width = shape
     grid = DirectionGrid(width, height)
     row, column = np.mgrid[:height, :width]
     towards = vectors(grid.theta_v(row), grid.theta_h(column))
-    fovea = vectors(theta_v, theta_h)
-    inside = great_circle_rad(towards, fovea) < 0.95 * CAP_RAD  # sides of a window are whole samples
-    return np.abs(model.range_mm - true_mm)[inside], np.sin(grid.theta_v(row))[inside]
+    inside = great_circle_rad(towards, vectors(theta_v, theta_h)) < 0.95 * CAP_RAD  # sides are whole samples
+    return inside, np.sin(grid.theta_v(row))[inside]
 
 
 async def test_a_spherical_scan_opens_whole_with_its_geometry(objects: Objects) -> None:
@@ -192,7 +199,7 @@ async def _errors_by_bytes(objects: Objects, name: str, place: tuple[float, floa
     true_mm = scan_of(*SCANS[name]).range_mm
     found = []
     async with connect(objects.url) as session:
-        for quantum in range(1, 9):
+        for quantum in (1, 2, 3, 4, 6, 8):
             model = await session.open(objects.scans[name])
             sampling = {"range": {"p": 1, "quantum": quantum}}
             update = await session.look_direction(*place, parameters=sampling)
