@@ -21,6 +21,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from node.durable import give_to_owner_of, make_private_folder, read_bounded, write_whole
+from node.last_used import LastUsed
 from protocol import pairing
 from protocol.errors import AccessError, LibraryError
 
@@ -77,11 +78,20 @@ class Access:
         self._lock = folder / LOCK_FILE
         self._seen: tuple[int, int] | None = None
         self._record = _Record()
+        self.last_used = LastUsed(folder)
         self.tokens()
 
     def tokens(self) -> tuple[Token, ...]:
         """All that stand, oldest first."""
         return self._current().tokens
+
+    def codes(self, now_s: float) -> tuple[Code, ...]:
+        """All that wait, oldest first."""
+        return _valid(self._current().codes, now_s)
+
+    def keep_last_used(self) -> None:
+        """Write down when tokens were used, as far as that is new."""
+        self.last_used.keep({token.digest for token in self.tokens()})
 
     def find(self, text: str) -> Token | None:
         """The token whose text this is; takes as long for any other text."""

@@ -87,17 +87,25 @@ def _tell_replaced(name: str, replaces: bool) -> None:
 
 def run_list(args: argparse.Namespace) -> int:
     """Print every login."""
-    tokens = _access(_config(args)).tokens()
+    access = _access(_config(args))
+    tokens = [(token, access.last_used.of(token.digest)) for token in access.tokens()]
     if args.json:
-        said = [{"name": token.name, "role": token.role, "created": token.created_unix_s} for token in tokens]
+        said = [
+            {"name": token.name, "role": token.role, "created": token.created_unix_s, "lastUsed": used}
+            for token, used in tokens
+        ]
         print(json.dumps({"tokens": said}))
         return 0
-    for token in tokens:
-        paired = datetime.fromtimestamp(token.created_unix_s).isoformat(" ", "minutes")
-        print(f"{paired}  {token.role:8} {token.name}")
+    for token, used in tokens:
+        last = f"last used {_minute(used)}" if used else "last used: not known"
+        print(f"{_minute(token.created_unix_s)}  {token.role:8} {token.name}  ({last})")
     if not tokens:
         print("nobody is paired")
     return 0
+
+
+def _minute(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s).isoformat(" ", "minutes")
 
 
 def run_revoke(args: argparse.Namespace) -> int:

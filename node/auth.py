@@ -121,6 +121,7 @@ class Auth:
             return NOBODY
         token = self._access.find(text)
         if token is not None:
+            self._access.last_used.note(token.digest, time.time())
             return Login(token.name, token.role, token)
         address, now_s = request.remote or "", time.monotonic()
         if self._wrong.is_locked(address, now_s):

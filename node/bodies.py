@@ -62,6 +62,44 @@ class NodeStatus(m.ServerInfo, frozen=True, kw_only=True, tag="serverInfo"):
     surveying: m.Count
 
 
+class Disk(_Body, frozen=True):
+    """The disk of the library. [bytes]"""
+
+    free_bytes: int
+    size_bytes: int
+
+
+class Certificate(_Body, frozen=True):
+    """What the node shows who it is by. fingerprint : SHA-256.  own : the node made it, and renews it."""
+
+    fingerprint: pairing.Hex256
+    ends: UnixTime
+    own: bool
+
+
+class Rules(_Body, frozen=True):
+    """When scans are deleted. null: never for that."""
+
+    max_age_days: float | None
+    max_gb: float | None
+
+
+class Upkeep(_Body, frozen=True):
+    """What who looks after a node wants to know. certificate : null without logins.  retention : what deletes scans."""
+
+    version: str
+    started: UnixTime
+    status: Status
+    reasons: tuple[str, ...]
+    capture: CaptureStatus
+    disk: Disk
+    certificate: Certificate | None
+    retention: Rules
+    scans: m.Count
+    interrupted: m.Count
+    streams: m.Count
+
+
 class AuditQuery(_Asked, frozen=True):
     """Which entries of the audit log, at most `limit`. since : the beginning of a time.  scan : that of an id."""
 
@@ -205,10 +243,11 @@ class PairingForm(Struct, frozen=True):
 
 
 class NewCode(_Asked, frozen=True):
-    """For whom a pairing code is."""
+    """For whom a pairing code is, and how long."""
 
     name: pairing.Name
     role: pairing.Role = "view"
+    minutes: Annotated[float, Meta(gt=0, le=60)] = 10
 
 
 class Offered(_Body, frozen=True):
@@ -216,11 +255,21 @@ class Offered(_Body, frozen=True):
 
     code: str
     fingerprint: pairing.Hex256
+    expires: UnixTime
+
+
+class ListedCode(_Body, frozen=True):
+    """A pairing code that waits. The code itself was said once."""
+
+    name: str
+    role: pairing.Role
+    expires: UnixTime
 
 
 class ListedToken(_Body, frozen=True):
-    """Somebody who is paired."""
+    """Somebody who is paired. last_used : null where that is not known."""
 
     name: str
     role: pairing.Role
     created: UnixTime
+    last_used: UnixTime | None

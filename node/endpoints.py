@@ -187,7 +187,10 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
             "DELETE", "/v1/scans/{scan}", "delete a scan", named=WHOLE, gives={204: None}, fails=(400,), event="deleted"
         ),
     )),
-    ("admin", "let in and put out; read who did what", (
+    ("admin", "let in and put out; read who did what, and how the node is kept", (
+        Endpoint(
+            "GET", "/v1/codes", "pairing codes that wait", gives={200: _json(tuple[b.ListedCode, ...])}, fails=(409,)
+        ),
         Endpoint(
             "POST", "/v1/codes", "a pairing code", takes=_json(b.NewCode), gives={201: _json(b.Offered)}, fails=(409,)
         ),
@@ -195,6 +198,7 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
             "GET", "/v1/tokens", "who is paired", gives={200: _json(tuple[b.ListedToken, ...])}, fails=(409,)
         ),
         Endpoint("DELETE", "/v1/tokens/{name}", "put somebody out", gives={204: None}, fails=(409,)),
+        Endpoint("GET", "/v1/upkeep", "health, disk, certificate, retention", gives={200: _json(b.Upkeep)}),
         Endpoint("GET", "/v1/audit", "who did what", query=b.AuditQuery, gives={200: _json(tuple[Entry, ...])}),
     )),
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
     GET /healthz    one word for anybody, the reasons for whoever has a login
     GET /metrics    (monitor) node.metrics
+    GET /v1/upkeep  (admin) what who looks after the node wants to know
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from aiohttp import web
 
 from node.audit import Audit
 from node.auth import LOGIN
-from node.bodies import HealthSaid
+from node.bodies import Certificate, Disk, HealthSaid, Rules, Upkeep
 from node.capture import Capture, CaptureStatus, SweepCounts
+from node.config import Retention
 from node.endpoints import route
 from node.exhibits import Exhibits
 from node.gate import Gate
@@ -28,7 +30,7 @@ from node.tls import Tls
 
 
 class HealthRoutes:
-    """The two routes. streams : how many there are.  is_stopping : whether the node is."""
+    """The routes above. streams : how many there are.  is_stopping : whether the node is."""
 
     def __init__(
         self,
@@ -40,6 +42,8 @@ class HealthRoutes:
         gate: Gate,
         streams: Callable[[], int],
         is_stopping: Callable[[], bool],
+        version: str,
+        retention: Callable[[], Retention],
     ) -> None:
         self._metrics = metrics
         self._exhibits = exhibits
@@ -49,11 +53,18 @@ class HealthRoutes:
         self._gate = gate
         self._streams = streams
         self._is_stopping = is_stopping
+        self._version = version
+        self._retention = retention
+        self._started_unix_s = time.time()
         metrics.show(self._now)
 
     def routes(self) -> list[web.RouteDef]:
         """What to add to the application."""
-        return [route("GET /healthz", self._health), route("GET /metrics", self._show)]
+        return [
+            route("GET /healthz", self._health),
+            route("GET /metrics", self._show),
+            route("GET /v1/upkeep", self._upkeep),
+        ]
 
     async def _health(self, request: web.Request) -> web.Response:
         health = await asyncio.to_thread(self._examine)
@@ -65,6 +76,17 @@ class HealthRoutes:
     async def _show(self, request: web.Request) -> web.Response:
         body = await asyncio.to_thread(self._metrics.exposition)
         return web.Response(body=body, headers={"Content-Type": MEDIA_TYPE})
+
+    async def _upkeep(self, request: web.Request) -> web.Response:
+        health, now = await asyncio.to_thread(lambda: (self._examine(), self._now()))
+        tls, rules = self._tls, self._retention()
+        upkeep = Upkeep(
+            self._version, self._started_unix_s, health.status, health.reasons, self._status(),
+            Disk(now.free_bytes, now.size_bytes),
+            Certificate(tls.fingerprint, tls.ends_unix_s, tls.is_own) if tls else None,
+            Rules(rules.max_age_days, rules.max_gb), now.scans, now.interrupted, now.streams,
+        )  # fmt: skip
+        return said(upkeep)
 
     def _status(self) -> CaptureStatus:
         return self._capture.status if self._capture else CaptureStatus("no scanner")

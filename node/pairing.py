@@ -3,6 +3,7 @@
     GET    /pair               a page for browsers: type the code, get a cookie
     POST   /v1/pair            a client proves a code and gets a token; that page's form sends the code itself
     POST   /v1/codes           (admin) a new code
+    GET    /v1/codes           (admin) which wait
     GET    /v1/tokens          (admin) who is paired
     DELETE /v1/tokens/{name}   (admin) revoke
 
@@ -25,7 +26,7 @@ from node.access import Access, Token
 from node.attempts import Attempts
 from node.audit import NODE, Audit, Who
 from node.auth import COOKIE, Refusal, asker
-from node.bodies import ListedToken, NewCode, Offered
+from node.bodies import ListedCode, ListedToken, NewCode, Offered
 from node.endpoints import route
 from node.rest import decoded, refusal, said
 from node.tls import Tls
@@ -91,6 +92,7 @@ class PairingRoutes:
             route("GET /pair", self._page),
             route("POST /v1/pair", self._pair),
             route("POST /v1/codes", self._offer),
+            route("GET /v1/codes", self._codes),
             route("GET /v1/tokens", self._tokens),
             route("DELETE /v1/tokens/{name}", self._revoke),
         ]
@@ -177,15 +179,21 @@ class PairingRoutes:
         access, tls = self._known()
         asked = decoded(await _bounded(request), NewCode)
         try:
-            code = await asyncio.to_thread(access.offer, asked.role, asked.name, time.time())
+            now_s, valid_s = time.time(), 60 * asked.minutes
+            code = await asyncio.to_thread(access.offer, asked.role, asked.name, now_s, valid_s)
         except AccessError as error:
             raise web.HTTPConflict(text=str(error)) from error
         self._audit.note("code offered", asker(request), what=f"{asked.name}: {asked.role}")
-        return said(Offered(code, tls.fingerprint), 201)
+        return said(Offered(code, tls.fingerprint, now_s + valid_s), 201)
 
     async def _tokens(self, request: web.Request) -> web.Response:
         access, _ = self._known()
-        return said([ListedToken(token.name, token.role, token.created_unix_s) for token in access.tokens()])
+        used = access.last_used.of
+        return said([ListedToken(t.name, t.role, t.created_unix_s, used(t.digest)) for t in access.tokens()])
+
+    async def _codes(self, request: web.Request) -> web.Response:
+        access, _ = self._known()
+        return said([ListedCode(code.name, code.role, code.expires_unix_s) for code in access.codes(time.time())])
 
     async def _revoke(self, request: web.Request) -> web.Response:
         access, _ = self._known()

@@ -7,6 +7,7 @@ import logging
 import secrets
 import socket
 import time
+from contextlib import suppress
 from dataclasses import asdict
 
 from aiohttp import WSCloseCode, web
@@ -57,6 +58,7 @@ GOODBYE_S = 1.0
 SLOW_S = 2.0  # more for those who read, and have not answered yet
 ACCESS_S = 0.5  # between looks at what other processes changed of tokens and certificate
 RETAIN_S = 600.0  # between looks at what was kept long enough
+KEEP_USED_S = 300.0  # between writing down when tokens were used
 RENEW_S = 3600.0  # between looks at the certificate
 REQUESTS_S = 1.0  # that requests in work get to end when the node stops
 ANSWERED = web.RequestKey("answered", bool)  # the head of the answer is made
@@ -85,6 +87,7 @@ class NodeServer:
         self._capture = capture
         self._is_stopping = False
         self._tls = tls
+        self._access = access
         self.audit = Audit(exhibits.library.folder, config.audit.bytes_max)
         audit_routes = AuditRoutes(self.audit, exhibits.library.folder, config.audit.bytes_max)
         self._auth = Auth(access, self._refused)
@@ -103,7 +106,7 @@ class NodeServer:
         pairing = PairingRoutes(access, tls, self.audit, self._refused, info.id, info.name, self._expel)
         health = HealthRoutes(
             self._metrics, exhibits, capture, tls, self.audit, self._gate,
-            lambda: len(self._connections), lambda: self._is_stopping,
+            lambda: len(self._connections), lambda: self._is_stopping, info.version, lambda: self._config.retention,
         )  # fmt: skip
         self.derivation = Derivation(exhibits, self.publish, self.audit)
         self._app.add_routes(ExchangeRoutes(exhibits, self.publish).routes())  # before /v1/scans/{scan}
@@ -163,7 +166,7 @@ class NodeServer:
 
     async def _watch_access(self) -> None:
         """Notice what commands beside this process revoke, and certificates that were renewed or are due."""
-        renewed_s = time.monotonic()
+        renewed_s = kept_s = time.monotonic()
         while True:
             await asyncio.sleep(ACCESS_S)
             try:
@@ -171,6 +174,9 @@ class NodeServer:
                 if self._tls is not None and time.monotonic() - renewed_s > RENEW_S:
                     renewed_s = time.monotonic()
                     await asyncio.to_thread(self._tls.refresh)
+                if self._access is not None and time.monotonic() - kept_s > KEEP_USED_S:
+                    kept_s = time.monotonic()
+                    await asyncio.to_thread(self._access.keep_last_used)
             except AccessError as error:
                 log.error("%s", error)
 
@@ -213,6 +219,9 @@ class NodeServer:
 
     async def _close_audit(self, app: web.Application) -> None:
         await asyncio.to_thread(self.audit.close)
+        if self._access is not None:
+            with suppress(AccessError):  # it was said while the node ran
+                await asyncio.to_thread(self._access.keep_last_used)
 
     def swept(self, scan_id: str, sweep: int = 0) -> None:
         """A sweep has become a scan: note it, tell every client, and see whether it is to be a sphere, too.

@@ -70,6 +70,11 @@ class Tls:
         self.fingerprint = shown
         return True
 
+    @property
+    def is_own(self) -> bool:
+        """Whether the node made its certificate itself, and renews it."""
+        return self._server.certificate is None
+
     def use(self, server: Server) -> None:
         """Take other settings; where they cannot be used, nothing changes. Raises AccessError."""
         before, self._server = self._server, server

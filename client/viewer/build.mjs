@@ -20,7 +20,9 @@ async function page(out) {
   await rm(out, { recursive: true, force: true });
   await mkdir(out, { recursive: true });
   const common = { ...COMMON, minify: true, platform: 'browser', external: ['fs', 'path'], outdir: out, metafile: true };
-  const { outputs } = (await build({ ...common, entryPoints: ['src/worker.ts', 'src/main.ts', 'src/style.css'] })).metafile;
+  const later = await build({ ...common, entryPoints: ['src/admin/admin.ts'] });
+  const admin = { ADMIN_FILE: JSON.stringify(named(later.metafile.outputs, 'src/admin/admin.ts')) };
+  const { outputs } = (await build({ ...common, define: admin, entryPoints: ['src/worker.ts', 'src/main.ts', 'src/style.css'] })).metafile;
   const [worker, script, style] = ['worker.ts', 'main.ts', 'style.css'].map((entry) => named(outputs, `src/${entry}`));
   const define = { WORKER_FILE: JSON.stringify(worker), MAIN_FILE: JSON.stringify(script) };
   const boot = named((await build({ ...common, define, entryPoints: ['src/boot.ts'] })).metafile.outputs, 'src/boot.ts');

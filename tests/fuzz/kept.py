@@ -27,7 +27,7 @@ from client.shared import refinements_in
 from client.trust import certificate_pin
 from drivers.address import check_address
 from exchange.image import encode_png, read_image
-from node import auth, library_routes, proxy, shared
+from node import auth, last_used, library_routes, proxy, shared
 from node.attempts import place_of_address
 from node.audit import NODE, begins_a_time, entry, read_trail
 from node.axes import FILE as AXES
@@ -75,6 +75,8 @@ def of_disks(folder: Path) -> Iterable[Target]:
     trail.append([msgspec.json.encode(entry("seen", NODE, scan=scan))])
     yield _file("audit-log", folder / "audit" / "audit.jsonl", lambda: list(read_trail(trail, scan="0")))
     yield from _certificates(folder / "access")
+    (folder / last_used.FILE).write_bytes(msgspec.json.encode({"0" * 64: 1.5}))
+    yield _file("last-used", folder / last_used.FILE, lambda: last_used.LastUsed(folder))
     yield _file("image", folder / "image.png", lambda: read_image(folder / "image.png"), encode_png(vase().texture))
     kept = credentials._File((credentials.Credential("n1", "https://n:1", "me", "view", "secret", "ab" * 32),))
     yield Target("credentials", (msgspec.json.encode(kept),), _CredentialsIn(folder / "config"))

@@ -19,7 +19,8 @@ PRIVATE = ("a secret name", "subject-0815")
 NOT_AUDITED = {  # they show, change and delete no scan, or are noted where they are done
     ("GET", "/"), ("GET", "/assets/{name}"), ("GET", "/healthz"), ("GET", "/metrics"), ("GET", "/v1/node"),
     ("GET", "/openapi.json"), ("GET", "/v1/axes"),
-    ("GET", "/v1/sweeps"), ("GET", "/v1/audit"), ("GET", "/pair"), ("GET", "/v1/tokens"),
+    ("GET", "/v1/sweeps"), ("GET", "/v1/audit"), ("GET", "/pair"), ("GET", "/v1/tokens"), ("GET", "/v1/codes"),
+    ("GET", "/v1/upkeep"),
     ("GET", "/v1/stream"),  # node.connection
     ("GET", "/v1/scans/{scan}/fovea"),  # leads to what is audited
     ("POST", "/v1/pair"), ("POST", "/v1/codes"), ("DELETE", "/v1/tokens/{name}"),  # node.pairing

@@ -134,10 +134,33 @@ async def test_an_admin_offers_lists_and_revokes(node: Entrance) -> None:
     async with node.ask("GET", "/v1/tokens", admin) as answer:
         listed = await answer.json()
     assert [(one["name"], one["role"]) for one in listed] == [("admin", "admin"), ("tablet", "operate")]
-    assert all(one.keys() == {"name", "role", "created"} for one in listed)
+    assert all(one.keys() == {"name", "role", "created", "lastUsed"} for one in listed)
     assert abs(listed[1]["created"] - time.time()) < 60
     async with node.ask("POST", "/v1/codes", admin, json={"name": "tablet"}) as answer:
         assert answer.status == 409
     for status in (204, 404):
         async with node.ask("DELETE", "/v1/tokens/tablet", admin) as answer:
             assert answer.status == status
+
+
+async def test_codes_that_wait_are_listed_without_the_code_and_can_be_ended(node: Entrance) -> None:
+    admin = node.token("admin")
+    wanted = {"name": "room 2", "role": "operate", "minutes": 30}
+    async with node.ask("POST", "/v1/codes", admin, json=wanted) as answer:
+        offered = await answer.json()
+    assert 29 * 60 < offered["expires"] - time.time() <= 30 * 60
+    async with node.ask("GET", "/v1/codes", admin) as answer:
+        listed = await answer.json()
+        assert listed == [{"name": "room 2", "role": "operate", "expires": offered["expires"]}]
+        assert offered["code"] not in await answer.text()
+    async with node.ask("DELETE", "/v1/tokens/room%202", admin) as answer:
+        assert answer.status == 204
+    async with node.ask("GET", "/v1/codes", admin) as answer:
+        assert await answer.json() == []
+
+
+@pytest.mark.parametrize("minutes", [0, 61, -1, "ten", None])
+async def test_a_code_is_valid_for_minutes(node: Entrance, minutes: object) -> None:
+    wanted = {"name": "room 2", "minutes": minutes}
+    async with node.ask("POST", "/v1/codes", node.token("admin"), json=wanted) as answer:
+        assert (answer.status, "minutes" in await answer.text()) == (400, True)

@@ -92,7 +92,8 @@ export function changeSidecar(id: string, revision: number, changes: Changes): P
   return ask('PATCH', `/v1/scans/${id}/sidecar`, changes, { 'If-Match': `"${revision}"` });
 }
 
-async function ask<T>(method: string, path: string, body?: unknown, headers: Record<string, string> = {}): Promise<T> {
+/** Ask the node for something, or to do it. Rejects with Refused. */
+export async function ask<T>(method: string, path: string, body?: unknown, headers: Record<string, string> = {}): Promise<T> {
   const init: RequestInit = { method, headers, cache: 'no-store' };
   if (body !== undefined) Object.assign(init, { body: JSON.stringify(body), headers: { ...headers, 'Content-Type': 'application/json' } });
   const answer = await fetch(path, init);

@@ -34,3 +34,4 @@ declare module '@cornerstonejs/codec-openjph/wasm' {
 /** Names of other scripts, which the build writes in. */
 declare const WORKER_FILE: string;
 declare const MAIN_FILE: string;
+declare const ADMIN_FILE: string;

@@ -6,6 +6,7 @@ import type { Measured } from './measuring.ts';
 
 const millimetres = (mm: number): string => `${mm < 100 ? mm.toFixed(2) : mm.toFixed(1)} mm`;
 
+const gigabytes = (bytes: number): string => `${(bytes / 1e9).toFixed(bytes < 1e10 ? 1 : 0)} GB`;
 const moment = (iso: string): string => when(Date.parse(iso) / 1000);
 const when = (unixS: number): string => new Date(1000 * unixS).toLocaleString(undefined, { dateStyle: 'medium', timeStyle: 'short' });
 
@@ -196,6 +197,63 @@ export const strings = {
     ],
   },
   role: 'You may look, measure and download here. To sweep, to set pins, to name or delete scans, have this browser paired with the role “operate”.',
+  admin: {
+    open: 'Administration',
+    heading: 'Administration',
+    close: 'Close',
+    health: 'How it is',
+    states: { ready: 'All is well.', capturing: 'All is well; a sweep runs.', degraded: 'It serves, but not all that it should:', stopping: 'It is stopping.' } as Record<string, string>,
+    scanner: 'Scanner',
+    disk: 'Disk',
+    free: (free: number, size: number) => `${gigabytes(free)} free of ${gigabytes(size)}`,
+    kept: 'Library',
+    counts: (scans: number, interrupted: number) => `${scans} ${scans === 1 ? 'scan' : 'scans'}${interrupted ? `, interrupted sweeps: ${interrupted}` : ''}`,
+    retention: 'Deleted by itself',
+    rules: (days: number | null, gb: number | null) =>
+      [days === null ? '' : `what is older than ${days} days`, gb === null ? '' : `the oldest, where scans take more than ${gb} GB`]
+        .filter(Boolean).join('; ') || 'nothing',
+    viewers: 'Open streams',
+    certificate: 'Certificate',
+    valid: (ends: number, own: boolean) => `until ${when(ends)}, ${own ? 'the node’s own, which it renews' : 'yours: renew it in time'}`,
+    noLogins: 'none: this node knows no logins',
+    fingerprint: 'Its SHA-256',
+    pairs: (hex: string) => hex.toUpperCase().match(/../g)!.join(':'),
+    version: 'Version',
+    since: (version: string, started: number) => `${version}, running since ${when(started)}`,
+    logins: 'Who may come in',
+    nobody: 'Nobody is paired.',
+    login: (role: string, created: number, used: number | null) =>
+      `${role} · since ${when(created)} · ${used === null ? 'last use not known' : `last used ${when(used)}`}`,
+    waits: (role: string, expires: number) => `${role} · a code waits until ${when(expires)}`,
+    revokeAsk: 'Revoke…',
+    revokeOf: (name: string) => `Revoke ${name}`,
+    sure: (name: string) => `Put ${name} out? What they are doing at this moment ends, too. To come back they have to be paired anew.`,
+    revoke: 'Revoke',
+    keep: 'Leave it',
+    pair: 'Let somebody in',
+    who: 'Name: who or where it is',
+    role: 'What they may do',
+    roles: { view: 'look', operate: 'also sweep and change', admin: 'also all of this here', monitor: 'only see how the node is' },
+    minutes: 'The code is good for',
+    lengths: [['10', '10 minutes'], ['30', '30 minutes'], ['60', '60 minutes']],
+    offer: 'Make a code',
+    codeFor: (name: string) => `The code for ${name}, good once and shown once:`,
+    left: (seconds: number) => `${Math.floor(seconds / 60)} min ${seconds % 60} s left`,
+    compare: 'Before it is typed into a browser, that browser must show this certificate (SHA-256):',
+    log: 'Who did what',
+    ofScan: 'Scan (beginning of its id)',
+    byWhom: 'By whom',
+    sinceDay: 'Since',
+    refused: 'Who was turned away instead',
+    show: 'Show',
+    shown: (count: number) => `${count} entries, the newest first`,
+    nothing: 'Nothing of that kind.',
+    older: (count: number) => `Show up to ${count}`,
+    onlyScan: (id: string) => `Only scan ${id.slice(0, 8)}`,
+    sweep: (id: string) => `sweep ${id.slice(0, 8)}`,
+    missing: (count: number) => `${count} entries before it are missing`,
+    moment,
+  },
   cost: {
     heading: 'What it cost',
     received: 'Received',

@@ -4,7 +4,8 @@
   const faults = [];
   const name = (one) => `${one.tagName.toLowerCase()}#${one.id} "${(one.innerText || one.ariaLabel || '').trim().slice(0, 40)}"`;
   const seen = (one) => one.checkVisibility({ visibilityProperty: true }) && one.getBoundingClientRect().width > 0;
-  const all = [...document.body.querySelectorAll('*')].filter(seen);
+  const top = document.querySelector('dialog:modal') ?? document.body; // nothing beneath a dialog can be reached
+  const all = [...top.querySelectorAll('*')].filter(seen);
   for (const one of all) {
     const texts = [...one.childNodes].filter((node) => node.nodeType === Node.TEXT_NODE && node.data.trim());
     for (const text of texts) {

@@ -9,9 +9,10 @@ import asyncio
 import io
 import json
 import tempfile
+import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from PIL import Image
@@ -21,8 +22,11 @@ import hatch_build
 from client.transfer import send_scan
 from exchange.native import write_native
 from foveascan import started
-from simulators.specimen import GENERATORS
-from tests.client.viewer.browser import click, launch, opened, wait_drawn, wait_updates
+from node.access import Access, access_folder
+from node.auth import COOKIE
+from node.library import About, Library
+from simulators.specimen import GENERATORS, make_specimen
+from tests.client.viewer.browser import blank, click, launch, opened, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
 
 FOLDER = hatch_build.VIEWER / "screenshots"
@@ -45,6 +49,7 @@ def main() -> None:
         _sweep(browser, node)
         _compare(browser, node, aside)
         _pole(browser, stack.enter_context(_pebble(aside, folder / "closed")))
+        _administration(browser, aside, folder / "logins")
 
 
 @contextmanager
@@ -63,6 +68,31 @@ def _pebble(aside: Executor, folder: Path) -> Iterator[str]:
         sent = send_scan(ready["url"], file, moved=lambda done, total: None)
         aside.submit(asyncio.run, sent).result()
         yield ready["url"]
+
+
+def _administration(browser: Browser, aside: Executor, folder: Path) -> None:
+    """A node with logins, as an admin sees it who has just made a code."""
+
+    def prepare() -> str:
+        with closing(Library(folder)) as library:
+            library.add(make_specimen("head", "S").grid, About(time.time()))
+        access, roles = Access(access_folder(folder)), {"me": "admin", "reception": "view", "room 2": "operate"}
+        return [access.grant(role, name, time.time()) for name, role in roles.items()][0]  # type: ignore[arg-type]
+
+    token = aside.submit(prepare).result()
+    with ExitStack() as stack:
+        node = started("serve", "--library", str(folder), "--listen", "127.0.0.1:0", "--json")
+        url = aside.submit(stack.enter_context, node).result()[1]["url"]
+        with blank(browser, ignore_https_errors=True, viewport=WIDE) as (page, _):
+            page.context.add_cookies([{"name": COOKIE, "value": token, "url": url, "secure": True}])
+            page.goto(url)
+            page.wait_for_selector("html[data-scan]", state="attached")
+            page.get_by_role("button", name="Administration").click()
+            page.get_by_label("Name: who or where it is").fill("tablet")
+            page.get_by_role("button", name="Make a code").click()
+            page.wait_for_selector("#admin .code code")
+            _take(page, "administration")
+        aside.submit(stack.close).result()
 
 
 def _looks(browser: Browser, node: RunningNode) -> None:

@@ -48,7 +48,7 @@ def test_a_browser_is_let_in_by_a_code_and_put_out_again(tmp_path: Path) -> None
             assert page.url.startswith(f"{ready['url']}/")
             assert "foveascan" not in page.evaluate("document.cookie")
             page.locator("aside details").evaluate_all("(all) => all.forEach((one) => (one.open = true))")
-            for what in ("Start a sweep", "Save", "Delete the scan", "sets a pin"):
+            for what in ("Administration", "Start a sweep", "Save", "Delete the scan", "sets a pin"):
                 found = page.locator("button, label").get_by_text(what).all()
                 assert found and not any(one.is_visible() for one in found), f"who may only look is offered: {what}"
             assert page.locator(".pin").get_by_text("mole").is_visible()

@@ -1,5 +1,6 @@
 import type { LinkState } from '../link.ts';
 import { strings } from '../strings.ts';
+import { AdminButton } from './admin_button.ts';
 import { h, refill } from './dom.ts';
 
 const NOTICE_MS = 6000;
@@ -17,6 +18,7 @@ export class Frame {
   readonly pictures = h('div', { id: 'pictures' });
   private readonly captions = h('div', { id: 'captions', hidden: true });
   private readonly link = h('p', { id: 'link', role: 'status' }, strings.link.connecting);
+  private readonly admin = new AdminButton();
   private readonly retry: HTMLButtonElement;
   private readonly notice = h('p', { id: 'notice', role: 'status' });
   private readonly hint = h('p', { id: 'hint' }, strings.view.hints.sharpen);
@@ -36,7 +38,7 @@ export class Frame {
     this.retry = h('button', { type: 'button', class: 'secondary', hidden: true, click: () => actions.retry() }, strings.link.again);
     this.stage = h('div', { id: 'stage' }, this.pictures, this.empty, this.notice, this.hint, zoom);
     root.append(
-      h('header', {}, h('h1', {}, strings.title), h('div', {}, this.link, this.retry)),
+      h('header', {}, h('h1', {}, strings.title), h('div', {}, this.link, this.retry, this.admin.element)),
       h('main', {}, h('section', { id: 'views', 'aria-label': strings.view.label.split('.')[0]! }, this.captions, this.stage), this.panel),
     );
   }
@@ -91,6 +93,7 @@ export class Frame {
     clearInterval(this.retryTimer);
     document.documentElement.dataset['link'] = link.state;
     this.retry.hidden = link.state !== 'lost';
+    this.admin.allow(link.state === 'ready' ? link.role : null);
     if (link.state === 'connecting') this.link.textContent = strings.link.connecting;
     if (link.state === 'ready') this.link.textContent = strings.link.ready(link.node);
     if (link.state !== 'lost') return;
