@@ -157,8 +157,8 @@ def run(command: list[str], limit_s: float = LIMIT_S, kept: Path = KEPT) -> int:
             ended = follow(command_line(kernel, first, kept, speed), kept_log, limit_s, silent_s)
         if ended != "silent":
             break
-        print(f"machine: not up after {silent_s:g} s with {speed}", file=sys.stderr)
-    if ended != "over":
+        print(f"machine: does not boot with {speed}", file=sys.stderr)
+    if ended == "late":
         print(f"machine: not over after {limit_s:g} s; see {log}", file=sys.stderr)
         return TIMED_OUT
     if not status.exists():
@@ -169,9 +169,10 @@ def run(command: list[str], limit_s: float = LIMIT_S, kept: Path = KEPT) -> int:
 def follow(command: list[str], log: IO[bytes], limit_s: float, silent_s: float) -> str:
     """Show and log what a machine says until it has ended ("over").
 
-    It is stopped when it has not said that it is up in `silent_s` ("silent"), or is not over in `limit_s` ("late").
+    It is stopped when it is not over in `limit_s` ("late"), or has not said in `silent_s` that it is up; one that ends
+    before it said so is "silent", too.
     """
-    ended, is_up = "over", False
+    is_up, heard = False, b""
     began_s = time.monotonic()
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, env=_environ()) as machine:
         assert machine.stdout is not None
@@ -183,8 +184,10 @@ def follow(command: list[str], log: IO[bytes], limit_s: float, silent_s: float) 
                 break
             data = os.read(machine.stdout.fileno(), 65536)
             if not data:
+                ended = "over" if is_up else "silent"
                 break
-            is_up = is_up or UP in data
+            heard = heard[-len(UP) :] + data  # it may come in pieces
+            is_up = is_up or UP in heard
             for stream in (log, sys.stdout.buffer):
                 stream.write(data.replace(b"\r\n", b"\n"))
                 stream.flush()

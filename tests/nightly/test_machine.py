@@ -52,9 +52,13 @@ def test_what_is_missing_here_is_named_with_its_packages(monkeypatch: pytest.Mon
 
 
 def test_what_a_machine_says_is_kept_to_its_end() -> None:
-    log = io.BytesIO()
-    assert machine.follow(["bash", "-c", "echo machine: up; echo all well"], log, LONG_S, LONG_S) == "over"
+    log, command = io.BytesIO(), ["bash", "-c", "printf mach; sleep 0.1; echo ine: up; echo all well"]
+    assert machine.follow(command, log, LONG_S, LONG_S) == "over"
     assert log.getvalue() == b"machine: up\nall well\n"
+
+
+def test_a_machine_that_does_not_boot_is_silent() -> None:
+    assert machine.follow(["bash", "-c", "echo no processor; exit 1"], io.BytesIO(), LONG_S, LONG_S) == "silent"
 
 
 @pytest.mark.parametrize(("limit_s", "silent_s", "ended"), [(LONG_S, 0.1, "silent"), (0.1, 0.1, "late")])
