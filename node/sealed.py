@@ -52,10 +52,8 @@ def is_sealed(folder: Path) -> bool:
 
 
 def is_open(folder: Path) -> bool:
-    """Whether a folder lies in what gocryptfs has mounted now. Raises OSError."""
-    place, best, kind = str(folder.absolute()), "", ""
-    if folder.exists():
-        place = str(folder.resolve())
+    """Whether a folder lies in what gocryptfs has mounted now, dead or alive. Raises OSError."""
+    place, best, kind = os.path.realpath(folder), "", ""
     for line in MOUNTS.read_text().splitlines():
         words = line.split()
         point = words[4]

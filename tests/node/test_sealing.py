@@ -295,6 +295,8 @@ def test_a_vault_that_dies_loses_nothing_that_was_kept(folder: Path) -> None:
         with pytest.raises(LibraryError):
             library.annotate(kept, Changes(name="x"), "ana")
         library.close()
+        with pytest.raises(LibraryError, match="cannot be used: Transport endpoint is not connected"):
+            Library(load_config(overrides={"library.folder": str(folder)}).library.path)
     with open_at(folder):
         library = Library(folder)
         assert [problem for _, problem in library.verify()] == [None]
