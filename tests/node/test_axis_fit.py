@@ -95,6 +95,11 @@ def test_repaired_cells_do_not_count() -> None:
     assert estimate(Grid(grid.spec, steps, grid.texture, cells), 80.0).fitting == 1.0
 
 
+def test_a_large_sweep_is_thinned() -> None:
+    found = estimate(swept(TRUE, spec=spec_of(1440, 301), noise_mm=0.02), 80.0)
+    assert max(errors(found, TRUE).values()) < 4 and found.samples == 60_000
+
+
 def test_a_corrected_sweep_tells_the_same_axis() -> None:
     grid = swept(TRUE, noise_mm=0.005)
     wrong = Axis(-0.7, 0.3, -0.002, 0.005, 20.0)
