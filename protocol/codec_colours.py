@@ -41,7 +41,7 @@ def encode(image: ImageArray, quality: float) -> bytes:
     """
     whole, sixteenths = divmod(round(quality * SIXTEENTHS), SIXTEENTHS)
     values = image.astype(np.float32)
-    turn = _turn_of(values)
+    turn = _turn_of(image)
     matrix = _SCALE * _FROM_YCC @ _axes(turn)
     offset = _MIDDLE + 0.5 - matrix @ np.full(3, _GREY)
     turned = cv2.transform(values, np.column_stack([matrix, offset])).astype(np.uint16)
@@ -74,15 +74,16 @@ def _read_prefix(payload: bytes) -> tuple[int, tuple[int, ...]]:
     return sixteenths, tuple(turn)
 
 
-def _turn_of(values: NDArray[Any]) -> tuple[int, ...]:
-    """The axes along which neighbouring texels differ most and least. values : (h, w, 3) float32.  In 127ths."""
-    steps = []
-    for plane in cv2.split(values):
-        rows, below = plane[:-1:_EVERY], plane[1::_EVERY]
-        across = rows[:, 1:] - rows[:, :-1]
-        steps.append((across.ravel(), (below - rows).ravel()))
-    varied = [[float(a @ b + c @ d) for b, d in steps] for a, c in steps]
-    _, axes = np.linalg.eigh(varied)
+def _turn_of(image: ImageArray) -> tuple[int, ...]:
+    """The axes along which neighbouring texels of an (h, w, 3) uint8 image differ most and least. In 127ths."""
+    rows, below = np.ascontiguousarray(image[:-1:_EVERY]), np.ascontiguousarray(image[1::_EVERY])
+    varied, steps = np.zeros((3, 3)), list[tuple[NDArray[Any], NDArray[Any]]]()
+    for k in range(3 if rows.size and rows.shape[1] > 1 else 0):
+        plane, plane_below = cv2.extractChannel(rows, k), cv2.extractChannel(below, k)
+        across = cv2.subtract(plane[:, 1:], plane[:, :-1], dtype=cv2.CV_32F).ravel()
+        steps.append((across, cv2.subtract(plane_below, plane, dtype=cv2.CV_32F).ravel()))
+        varied[k, : k + 1] = [across @ other + steps[k][1] @ down for other, down in steps]
+    _, axes = np.linalg.eigh(varied)  # reads the lower triangle
     axes = axes.T[::-1]
     quaternion = _quaternion(axes if np.linalg.det(axes) > 0 else -axes)
     return tuple(np.rint(_UNIT * quaternion).astype(int).tolist())
