@@ -130,10 +130,13 @@ class Audit:
         """How many entries are not written yet."""
         return self._done.waiting + self._refused.waiting
 
-    def close(self, timeout_s: float = 1.0) -> None:
-        """Write what waits, and end."""
-        self._done.close(timeout_s)
-        self._refused.close(timeout_s)
+    def close(self, timeout_s: float = 3.0) -> None:
+        """Write what waits, and end. timeout_s : for both histories; what a slow disk has not taken by then is lost."""
+        until_s = time.monotonic() + timeout_s
+        for writer in (self._done, self._refused):
+            writer.end()
+        for writer in (self._done, self._refused):
+            writer.wait(until_s - time.monotonic())
 
 
 class _Writer:
@@ -169,12 +172,14 @@ class _Writer:
         with self._news:
             self._left_out += 1
 
-    def close(self, timeout_s: float) -> None:
+    def end(self) -> None:
         with self._news:
             self._is_closing = True
             self._news.notify()
+
+    def wait(self, timeout_s: float) -> None:
         if self._thread is not None:
-            self._thread.join(timeout_s)
+            self._thread.join(max(timeout_s, 0.0))
         if self._entries or self._left_out:
             log.error("audit: %d entries are lost: %s", len(self._entries) + self._left_out, self.trouble or "no time")
 
