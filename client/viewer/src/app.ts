@@ -168,8 +168,7 @@ export class App {
       this.node = link.node;
       this.allow(link.role !== 'view');
     }
-    void this.refreshScans();
-    void this.refreshCapture();
+    void this.pane.pictured.then(() => Promise.all([this.refreshScans(), this.refreshCapture()]));
   }
 
   /** Show what who looks may do, and nothing that the node would refuse. */
@@ -189,8 +188,7 @@ export class App {
     this.about.show(info);
     this.showComparison();
     if (framed) this.restoreState(info.id);
-    void this.sidecar.open(info.id);
-    void this.readWorth(info.id);
+    void this.pane.pictured.then(() => this.readMore(info.id));
   }
 
   /** What the address asks for, when it is about this scan; else a clean view of it. */
@@ -335,7 +333,9 @@ export class App {
     this.pane.open('latest');
   }
 
-  private async readWorth(scan: string): Promise<void> {
+  private async readMore(scan: string): Promise<void> {
+    if (this.pane.info?.id !== scan) return;
+    void this.sidecar.open(scan);
     const account = await readAccount(scan).catch(() => null);
     if (this.pane.info?.id === scan) this.worth.show(account);
   }

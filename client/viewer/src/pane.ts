@@ -11,6 +11,9 @@ import { Marks } from './ui/marks.ts';
 import type { Place } from './view/room.ts';
 import { Stage } from './view/stage.ts';
 
+/** So long nothing else is asked for, at most, while the first view is on its way. */
+const PICTURE_MS = 1000;
+
 /** What a worker says of the scan it has open. */
 export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'updated' | 'refused' | 'traffic' | 'broken' }>;
 
@@ -50,6 +53,10 @@ export class Pane {
   info: ScanInfo | null = null;
   /** Where detail was got, in order. */
   foveae: Place[] = [];
+  /** Kept once a first picture stands, or none will soon: whatever else the page asks for waits for it. */
+  readonly pictured: Promise<void>;
+  private picture!: () => void;
+  private isPictured = false;
   private looks = 0;
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
@@ -65,8 +72,10 @@ export class Pane {
     assign(canvas, { tabindex: 0, role: 'application', 'aria-label': strings.view.label });
     this.element = h('div', { class: 'picture' }, canvas);
     this.noted = noted ?? this.element;
+    this.pictured = new Promise((resolve) => (this.picture = resolve));
+    setTimeout(() => this.picture(), PICTURE_MS);
     this.stage = new Stage(canvas, context, {
-      drawn: () => this.marks?.update(),
+      drawn: () => this.drawn(),
       moved: () => this.events.moved(),
       settled: () => this.events.changed(),
       lost: () => this.events.say(strings.link.graphicsLost),
@@ -98,6 +107,7 @@ export class Pane {
         break;
       case 'patch':
         this.stage.patch(said.channel, said.changed, said.level);
+        if (said.isLast) this.stage.paintNow();
         break;
       case 'updated':
         this.updated(said.answer);
@@ -158,6 +168,13 @@ export class Pane {
     this.next();
   }
 
+  private drawn(): void {
+    this.marks?.update();
+    if (!this.info || this.isPictured) return;
+    this.isPictured = true;
+    void this.stage.done().then(() => this.picture());
+  }
+
   private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {
     const framed = fresh && this.info?.id !== snapshot.info.id;
     this.info = snapshot.info;
@@ -172,6 +189,7 @@ export class Pane {
     if (this.stage.shrunk > 1) this.events.say(strings.shrunk(this.stage.shrunk));
     this.noted.dataset['scan'] = snapshot.info.id;
     this.events.opened(snapshot.info, fresh, framed);
+    this.stage.paintNow();
   }
 
   private updated(answer: Answer): void {

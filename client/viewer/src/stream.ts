@@ -21,6 +21,7 @@ const CLIENT = 'foveascan viewer';
 const VIOLATION = 4002;
 const PICTURE_MS = 100;
 const TOGETHER_MS = 30;
+const TRAFFIC_MS = 500;
 
 interface Looking {
   look: Look;
@@ -53,6 +54,7 @@ export class Stream {
   private looking: Looking | null = null;
   private applyMs = 0;
   private received = 0;
+  private trafficTimer: ReturnType<typeof setTimeout> | undefined;
   private sent = 0;
   private picture: LivePicture | null = null;
   private pictureTimer: ReturnType<typeof setTimeout> | undefined;
@@ -209,7 +211,7 @@ export class Stream {
     }
     const { channel } = refinement;
     const level = model.holdings.channels[channel].level.slice();
-    this.patches.push(...inParts(changed).map((part) => ({ kind: 'patch', channel, changed: part, level }) as const));
+    this.patches.push(...inParts(changed).map((part) => ({ kind: 'patch', channel, changed: part, level, isLast: false }) as const));
   }
 
   /**
@@ -225,13 +227,16 @@ export class Stream {
   private tellPatches(): void {
     clearTimeout(this.patchTimer);
     this.patchTimer = undefined;
-    for (const patch of this.patches.splice(0)) this.tell(patch, patch.changed.map(({ cells }) => cells.buffer as ArrayBuffer));
+    const patches = this.patches.splice(0);
+    patches.forEach((patch, at) => {
+      this.tell({ ...patch, isLast: at === patches.length - 1 }, patch.changed.map(({ cells }) => cells.buffer as ArrayBuffer));
+    });
   }
 
   private firstView(model: Model): void {
     if (!model.complete) return;
-    this.acknowledge(model);
     this.tellAll();
+    this.acknowledge(model);
     if (this.looking) this.sendLook();
   }
 
@@ -279,6 +284,7 @@ export class Stream {
     const [errorMaxMm, textureDb] = [said?.errorMaxMm ?? null, said?.textureDb ?? null];
     const elapsedMs = performance.now() - began;
     this.tellPatches();
+    this.tellTraffic();
     this.tell({ kind: 'updated', answer: { look: look.request, reason, bytes, elapsedMs, nodeMs: said?.nodeMs ?? 0, applyMs, errorMaxMm, textureDb } });
   }
 
@@ -302,6 +308,13 @@ export class Stream {
 
   private count(data: string | ArrayBuffer): void {
     this.received += typeof data === 'string' ? data.length : data.byteLength;
+    this.trafficTimer ??= setTimeout(() => this.tellTraffic(), TRAFFIC_MS);
+  }
+
+  /** With what it brought, or now and then: for each new number the browser puts the whole page together once more. */
+  private tellTraffic(): void {
+    clearTimeout(this.trafficTimer);
+    this.trafficTimer = undefined;
     this.tell({ kind: 'traffic', received: this.received, sent: this.sent });
   }
 
@@ -329,6 +342,7 @@ export class Stream {
   private tellAll(): void {
     this.patches = []; // the snapshot has them
     tellAll(this.model!, this.unseen, this.tell);
+    this.tellTraffic();
     this.unseen = false;
   }
 }

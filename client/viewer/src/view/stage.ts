@@ -135,12 +135,12 @@ export class Stage {
     this.draw();
   }
 
-  /** Take rectangles that have changed. */
+  /** Take rectangles that have changed; they are seen with the next picture. */
   patch(channel: Channel, changed: Changed[], level: Uint8Array): void {
     const before = this.partOf(channel, changed);
     this.surface?.patch(channel, changed, level);
     const after = channel === RANGE ? this.partOf(channel, changed) : before; // colour moves nothing
-    this.draw(before === 'all' || after === 'all' ? 'all' : joined(before, after));
+    this.change(before === 'all' || after === 'all' ? 'all' : joined(before, after));
   }
 
   /** The part of the picture that shows these samples; where a graphics card draws, all is as soon drawn. */
@@ -253,9 +253,14 @@ export class Stage {
     this.settle();
   }
 
+  /** Once all that was drawn is in the picture. */
+  done(): Promise<void> {
+    return cardIsDone(this.renderer);
+  }
+
   /** Do what the first picture could do without, so that the first look need not wait for it. */
   private async useLeisure(): Promise<void> {
-    await cardIsDone(this.renderer);
+    await this.done();
     this.surface?.makeReady();
   }
 
@@ -285,10 +290,19 @@ export class Stage {
 
   /** Ask for a picture, or to have a part of it drawn anew; any number of calls make one. */
   draw(part: Part | 'all' | null = 'all'): void {
-    this.due = part === 'all' || this.due === 'all' ? 'all' : joined(this.due, part);
+    this.change(part);
     if (this.asked || !this.isWarm) return;
     this.asked = true;
     requestAnimationFrame((nowMs) => this.paint(nowMs));
+  }
+
+  private change(part: Part | 'all' | null): void {
+    this.due = part === 'all' || this.due === 'all' ? 'all' : joined(this.due, part);
+  }
+
+  /** Draw what is due without waiting for the browser's next frame. */
+  paintNow(): void {
+    this.paint(performance.now());
   }
 
   private paint(nowMs: number): void {
