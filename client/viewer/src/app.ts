@@ -109,8 +109,9 @@ export class App {
     this.display = new DisplayPanel(() => this.showAs());
     this.frame.pictures.append(this.pane.element);
     this.frame.stage.append(this.display.legend);
-    this.frame.add(...[this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel, this.display,
-      this.pins.panel, this.worth, this.cost, this.about].map(({ element }) => element));
+    const panels = [this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel, this.display, this.pins.panel,
+      this.worth, this.cost, this.about];
+    void this.pane.pictured.then(() => this.frame.add(...panels.map(({ element }) => element)));
     addEventListener('hashchange', () => this.addressChanged());
     addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);

@@ -7,7 +7,7 @@ import { parseState } from './url_state.ts';
 
 /** A worker with a stream of its own, that opens a scan. */
 function hire(scan: string): Worker {
-  const worker = new Worker(new URL(WORKER_FILE, import.meta.url), { type: 'module' });
+  const worker = new Worker(new URL(WORKER_FILE, import.meta.url)); // a module would start later
   worker.postMessage({ kind: 'start', origin: location.origin, scan });
   return worker;
 }

@@ -53,7 +53,7 @@ export class Pane {
   info: ScanInfo | null = null;
   /** Where detail was got, in order. */
   foveae: Place[] = [];
-  /** Kept once a first picture stands, or none will soon: whatever else the page asks for waits for it. */
+  /** Kept once a first picture stands, or none will soon: panels, and what else the page asks for, wait for it. */
   readonly pictured: Promise<void>;
   private picture!: () => void;
   private isPictured = false;

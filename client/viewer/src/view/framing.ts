@@ -12,14 +12,18 @@ export interface Bounds {
   topMm: number;
 }
 
+/** Of so many rows and columns some are enough to see how large a scan is. */
+const LINES = 256;
+
 /** How far from the axis, how low and how high something was measured. */
 export function boundsOf(info: ScanInfo, steps: Uint16Array): Bounds {
   const { width, height, stepMm, pitchMm, zMaxMm } = info;
   const bounds = { radiusMm: 0, bottomMm: Infinity, topMm: -Infinity };
   const polar = isSphere(info) ? Math.PI / height : 0;
-  for (let row = 0; row < height; row++) {
+  const [across, down] = [width, height].map((size) => Math.max(1, Math.floor(size / LINES))) as [number, number];
+  for (let row = 0; row < height; row += down) {
     let most = 0;
-    for (let at = row * width; at < (row + 1) * width; at++) if (steps[at]! > most) most = steps[at]!;
+    for (let at = row * width; at < (row + 1) * width; at += across) if (steps[at]! > most) most = steps[at]!;
     if (!most) continue;
     const reach = most * stepMm;
     const [upper, lower] = [row, row + 1].map((edge) => zMaxMm + (polar ? reach * Math.cos(polar * edge) : -edge * pitchMm));

@@ -36,9 +36,14 @@ export class Normals {
     uniforms['uNormals']!.value = this.target.texture;
   }
 
-  /** Have the programs compiled. */
-  async compile(): Promise<void> {
-    await Promise.all([this.pass, this.copy].map((pass) => pass.compile(this.renderer, this.target)));
+  /** Have the program compiled that the first picture takes. */
+  compile(): Promise<void> {
+    return this.pass.compile(this.renderer, this.target);
+  }
+
+  /** Have the other one compiled, which `fill` takes. */
+  compileFill(): Promise<void> {
+    return this.copy.compile(this.renderer, this.target);
   }
 
   /** Whether there is a normal for every sample. */

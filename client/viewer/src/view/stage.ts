@@ -261,7 +261,7 @@ export class Stage {
   /** Do what the first picture could do without, so that the first look need not wait for it. */
   private async useLeisure(): Promise<void> {
     await this.done();
-    this.surface?.makeReady();
+    if (await this.surface?.makeReady()) this.draw();
   }
 
   /** Draw the smallest surface of a kind, so that programs are there, and the card knows them, before a scan is. */
@@ -302,7 +302,8 @@ export class Stage {
 
   /** Draw what is due without waiting for the browser's next frame. */
   paintNow(): void {
-    this.paint(performance.now());
+    if (document.hidden) this.draw(null); // nobody sees it yet
+    else this.paint(performance.now());
   }
 
   private paint(nowMs: number): void {

@@ -43,6 +43,7 @@ export class Surface {
   private dense: DataTexture;
   private readonly normals: Normals;
   private isReady = false;
+  private isGone = false;
   private readonly uniforms: Uniforms;
 
   constructor(
@@ -82,13 +83,16 @@ export class Surface {
     await Promise.all([compile(this.renderer, this.object, camera), this.normals.compile()]);
   }
 
-  /** Do what the first picture could do without, so that the first look need not wait for it. */
-  makeReady(): void {
-    if (this.isReady) return;
+  /** Do what the first picture could do without, so that the first look need not wait for it. Returns whether it shows. */
+  async makeReady(): Promise<boolean> {
+    if (this.isReady) return false;
     this.isReady = true;
+    await this.normals.compileFill();
+    if (this.isGone) return false;
     this.normals.fill();
     // three.js asks the card about uploads once, and waits for the answer.
     this.upload(integers(this.steps.slice(0, 1), 1, 1, 'R16UI'), this.range, 0, 0);
+    return true;
   }
 
   /** Samples from one that is held to the next, at a place. */
@@ -148,7 +152,7 @@ export class Surface {
 
   /** Where rectangles of a channel are seen in a picture, as far as they change it; 'all' where that is not known. */
   seenAt(channel: Channel, changed: Changed[], camera: PerspectiveCamera, width: number, height: number): Part | 'all' | null {
-    if (isSphere(this.info)) return 'all';
+    if (isSphere(this.info) || !this.normals.isFull) return 'all';
     let part: Part | null = null;
     for (const rectangle of changed) {
       const cells = channel === RANGE ? grown(rectangle, NORMALS_REACH) : this.cellsOf(rectangle);
@@ -168,6 +172,7 @@ export class Surface {
   }
 
   dispose(): void {
+    this.isGone = true;
     for (const texture of [this.range, ...this.levels, this.coarse, this.dense]) texture.dispose();
     this.normals.dispose();
     for (const mesh of [...this.meshes, ...this.fans]) {
