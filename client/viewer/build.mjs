@@ -3,12 +3,22 @@
 import { build } from 'esbuild';
 import { createHash } from 'node:crypto';
 import { mkdir, readFile, readdir, rm, writeFile } from 'node:fs/promises';
-import { join } from 'node:path';
+import { join, resolve } from 'node:path';
 import { constants, gzipSync } from 'node:zlib';
 
 const COMMON = {
   bundle: true, format: 'esm', target: 'es2022', legalComments: 'none', logLevel: 'warning', charset: 'utf8',
   loader: { '.wasm': 'file', '.svg': 'file' }, assetNames: '[name]-[hash]', entryNames: '[name]-[hash]',
+};
+
+// three.js brings the shaders of all its materials, a quarter of what it is. Ours are raw, and include none of them.
+const WITHOUT_SHADERS = {
+  name: 'without shaders',
+  setup({ onResolve, onLoad }) {
+    onResolve({ filter: /^three$/ }, () => ({ path: resolve('node_modules/three/src/Three.js'), sideEffects: false }));
+    onLoad({ filter: /three\/src\/renderers\/shaders\/ShaderChunk\.js$/ }, () => ({ contents: 'export const ShaderChunk = {};' }));
+    onLoad({ filter: /three\/src\/renderers\/shaders\/ShaderLib\.js$/ }, () => ({ contents: 'export const ShaderLib = {};' }));
+  },
 };
 
 const named = (outputs, entry) => {
@@ -19,7 +29,7 @@ const named = (outputs, entry) => {
 async function page(out) {
   await rm(out, { recursive: true, force: true });
   await mkdir(out, { recursive: true });
-  const common = { ...COMMON, minify: true, platform: 'browser', external: ['fs', 'path'], outdir: out, metafile: true };
+  const common = { ...COMMON, minify: true, platform: 'browser', external: ['fs', 'path'], outdir: out, metafile: true, plugins: [WITHOUT_SHADERS] };
   const later = await build({ ...common, entryPoints: ['src/admin/admin.ts'] });
   const admin = { ADMIN_FILE: JSON.stringify(named(later.metafile.outputs, 'src/admin/admin.ts')) };
   const { outputs } = (await build({ ...common, define: admin, entryPoints: ['src/worker.ts', 'src/main.ts', 'src/style.css'] })).metafile;

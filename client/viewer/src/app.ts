@@ -29,8 +29,7 @@ import { formatState, parseState } from './url_state.ts';
 import type { ViewState } from './url_state.ts';
 import type { Place } from './view/room.ts';
 
-const [CAPTURE_MS, LIST_MS] = [2000, 10_000];
-const WRITE_MS = 200;
+const [CAPTURE_MS, LIST_MS, WRITE_MS] = [2000, 10_000, 200];
 const NOWHERE: ViewState = { scan: null, camera: null, foveae: [], pins: [], beside: null };
 
 export class App {
@@ -109,9 +108,9 @@ export class App {
     this.display = new DisplayPanel(() => this.showAs());
     this.frame.pictures.append(this.pane.element);
     this.frame.stage.append(this.display.legend);
-    const panels = [this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel, this.display, this.pins.panel,
-      this.worth, this.cost, this.about];
-    void this.pane.pictured.then(() => this.frame.add(...panels.map(({ element }) => element)));
+    this.frame.showAfter(this.pane.pictured);
+    void this.pane.calm.then(() => this.frame.add(...[this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel,
+      this.display, this.pins.panel, this.worth, this.cost, this.about].map(({ element }) => element)));
     addEventListener('hashchange', () => this.addressChanged());
     addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
@@ -169,7 +168,7 @@ export class App {
       this.node = link.node;
       this.allow(link.role !== 'view');
     }
-    void this.pane.pictured.then(() => Promise.all([this.refreshScans(), this.refreshCapture()]));
+    void this.pane.calm.then(() => Promise.all([this.refreshScans(), this.refreshCapture()]));
   }
 
   /** Show what who looks may do, and nothing that the node would refuse. */
@@ -189,7 +188,7 @@ export class App {
     this.about.show(info);
     this.showComparison();
     if (framed) this.restoreState(info.id);
-    void this.pane.pictured.then(() => this.readMore(info.id));
+    void this.pane.calm.then(() => this.readMore(info.id));
   }
 
   /** What the address asks for, when it is about this scan; else a clean view of it. */
@@ -331,7 +330,7 @@ export class App {
     this.close();
     this.state = { ...NOWHERE };
     await this.refreshScans();
-    this.pane.open('latest');
+    this.frame.showEmpty(this.scans.scans.length ? 'gone' : 'none'); // another one might pass for the one that was meant
   }
 
   private async readMore(scan: string): Promise<void> {

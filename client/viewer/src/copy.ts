@@ -53,7 +53,7 @@ async function fileOf(held: Held, refinements: Uint8Array): Promise<Blob> {
     '<!doctype html><html lang="en"><head><meta charset="utf-8">', `<meta http-equiv="Content-Security-Policy" content="${policy}">`,
     '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">',
     '<meta name="robots" content="noindex"><title>foveascan</title><link rel="icon" href="data:,">', '<style>', styleText, '</style></head>',
-    '<body><div id="app"></div><noscript>This page needs JavaScript.</noscript>',
+    `<body><div id="app"><p class="late">${strings.copy.broken}</p></div>`, '<noscript>This page needs JavaScript.</noscript>',
     data(HELD, JSON.stringify(held).replaceAll('<', '\\u003c')), data(REFINEMENTS, await base64(refinements)),
     data(WASM, await base64(new Uint8Array(wasmBytes))), data(WORKER, workerText), data('licenses', noticeText),
     '<script type="module">', scriptText, '</script></body></html>\n',

@@ -88,6 +88,7 @@ export const isCopy = (): boolean => document.getElementById(HELD) !== null;
 export function showCopy(root: HTMLElement): void {
   const canvas = document.createElement('canvas');
   const context = canvas.getContext('webgl2', CONTEXT);
+  root.replaceChildren(); // what it says if a part of it is missing, this script among it
   if (context) new OfflineCopy(root, canvas, context);
   else root.replaceChildren(h('main', { class: 'sorry' }, h('p', {}, strings.noWebgl)));
 }

@@ -11,8 +11,8 @@ import { Marks } from './ui/marks.ts';
 import type { Place } from './view/room.ts';
 import { Stage } from './view/stage.ts';
 
-/** So long nothing else is asked for, at most, while the first view is on its way. */
-const PICTURE_MS = 1000;
+/** So long the page waits for its first picture before it shows, or asks for, anything else. */
+const PICTURE_MS = 400;
 
 /** What a worker says of the scan it has open. */
 export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'updated' | 'refused' | 'traffic' | 'broken' }>;
@@ -53,10 +53,11 @@ export class Pane {
   info: ScanInfo | null = null;
   /** Where detail was got, in order. */
   foveae: Place[] = [];
-  /** Kept once a first picture stands, or none will soon: panels, and what else the page asks for, wait for it. */
+  /** Kept once a first picture is painted, or none will be soon. */
   readonly pictured: Promise<void>;
+  /** The same once the card has drawn it: panels, and what else the page asks for, wait for it. */
+  readonly calm: Promise<void>;
   private picture!: () => void;
-  private isPictured = false;
   private looks = 0;
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
@@ -73,6 +74,7 @@ export class Pane {
     this.element = h('div', { class: 'picture' }, canvas);
     this.noted = noted ?? this.element;
     this.pictured = new Promise((resolve) => (this.picture = resolve));
+    this.calm = this.pictured.then(() => this.stage.done());
     setTimeout(() => this.picture(), PICTURE_MS);
     this.stage = new Stage(canvas, context, {
       drawn: () => this.drawn(),
@@ -139,6 +141,7 @@ export class Pane {
 
   /** Show nothing. */
   clear(): void {
+    this.picture();
     this.info = null;
     delete this.noted.dataset['scan'];
     this.endLook();
@@ -170,9 +173,7 @@ export class Pane {
 
   private drawn(): void {
     this.marks?.update();
-    if (!this.info || this.isPictured) return;
-    this.isPictured = true;
-    void this.stage.done().then(() => this.picture());
+    if (this.info) this.picture();
   }
 
   private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {

@@ -164,7 +164,7 @@ def test_detail_follows_the_pointer(browser: Browser, node: RunningNode) -> None
         assert box is not None
         page.mouse.move(box["x"] + 0.48 * box["width"], box["y"] + 0.5 * box["height"])
         page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
-        wait_updates(page, 1)
+        page.wait_for_selector('html[data-updates][data-looking="no"]', state="attached")  # of one look or of both
 
 
 def test_what_is_coming_can_be_stopped(browser: Browser, node: RunningNode) -> None:

@@ -293,6 +293,11 @@ def test_an_offline_copy_shows_the_same_and_asks_nobody(browser: Browser, kept: 
         asked = f"fetch('{kept.url}/healthz', {{ mode: 'no-cors' }}).then(() => 'answered', () => 'refused')"
         assert page.evaluate(asked) == "refused"
         assert any("Content Security Policy" in problem for problem in problems)
+    cut = tmp_path / "cut.html"
+    cut.write_bytes(file.read_bytes()[: -file.stat().st_size // 3])
+    with blank(browser) as (page, _):
+        page.goto(cut.as_uri())
+        page.get_by_text("This file is damaged").wait_for()
 
 
 def settled(page: Page, meant: Callable[[list[float], list[float]], bool]) -> tuple[list[float], list[float]]:

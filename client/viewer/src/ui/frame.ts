@@ -29,7 +29,7 @@ export class Frame {
   private retryTimer: ReturnType<typeof setInterval> | undefined;
   private noticeTimer: ReturnType<typeof setTimeout> | undefined;
 
-  constructor(root: HTMLElement, actions: FrameActions) {
+  constructor(private readonly root: HTMLElement, actions: FrameActions) {
     const button = (text: string, label: string, act: () => void) =>
       h('button', { type: 'button', class: 'secondary', 'aria-label': label, title: label, click: act }, text);
     const zoom = h('div', { id: 'zoom' },
@@ -41,6 +41,12 @@ export class Frame {
       h('header', {}, h('h1', {}, strings.title), h('div', {}, this.link, this.retry, this.admin.element)),
       h('main', {}, h('section', { id: 'views', 'aria-label': strings.view.label.split('.')[0]! }, this.captions, this.stage), this.panel),
     );
+  }
+
+  /** Show all that is there in one go: each time the browser puts the page together the picture waits. */
+  showAfter(pictured: Promise<void>): void {
+    this.root.style.visibility = 'hidden';
+    void pictured.then(() => (this.root.style.visibility = ''));
   }
 
   /** Put panels beside the picture. */

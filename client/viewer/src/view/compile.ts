@@ -11,7 +11,7 @@ export async function cardIsDone(renderer: WebGLRenderer): Promise<void> {
   const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
   gl.flush();
   while (fence && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
-    await new Promise((look) => setTimeout(look, LOOK_MS));
+    await aMoment();
   }
   gl.deleteSync(fence);
 }
@@ -21,14 +21,26 @@ export async function cardIsDone(renderer: WebGLRenderer): Promise<void> {
  * three.js would ask at the first picture, and wait for all that the card was given until then.
  */
 export async function compile(renderer: WebGLRenderer, object: Object3D, camera: Camera): Promise<void> {
-  if (renderer.extensions.has('KHR_parallel_shader_compile')) await renderer.compileAsync(object, camera);
-  else renderer.compile(object, camera);
+  renderer.compile(object, camera);
+  const gl = renderer.getContext();
+  while (!gl.isContextLost() && programsOf(renderer, object).some((program) => !program.isReady())) await aMoment();
   await cardIsDone(renderer);
-  object.traverse((each) => {
-    if (each instanceof Mesh) (renderer.properties.get(each.material) as Compiled).currentProgram.getUniforms();
-  });
+  for (const program of programsOf(renderer, object)) program.getUniforms();
 }
 
-interface Compiled {
-  currentProgram: { getUniforms(): unknown };
+interface Program {
+  isReady(): boolean;
+  getUniforms(): unknown;
 }
+
+/** Of an object that is still there. */
+function programsOf(renderer: WebGLRenderer, object: Object3D): Program[] {
+  const programs: Program[] = [];
+  object.traverse((each) => {
+    const { currentProgram } = (each instanceof Mesh ? renderer.properties.get(each.material) : {}) as { currentProgram?: Program };
+    if (currentProgram) programs.push(currentProgram);
+  });
+  return programs;
+}
+
+const aMoment = (): Promise<void> => new Promise((look) => setTimeout(look, LOOK_MS));

@@ -2,13 +2,13 @@
 
 import {
   BufferAttribute, DoubleSide, DynamicDrawUsage, GLSL3, InstancedBufferAttribute, InstancedBufferGeometry, Mesh, NoBlending,
-  ShaderMaterial,
+  RawShaderMaterial,
 } from 'three';
 import type { IUniform } from 'three';
 import { definesOf, SURFACE_FRAGMENT, SURFACE_VERTEX } from './shaders.ts';
 
 export type Uniforms = Record<string, IUniform>;
-export type GridMesh = Mesh<InstancedBufferGeometry, ShaderMaterial>;
+export type GridMesh = Mesh<InstancedBufferGeometry, RawShaderMaterial>;
 
 /** Instances of a part, at one stride, of a surface whose textures are shared. */
 export function gridMesh(
@@ -22,7 +22,7 @@ export function gridMesh(
     geometry.setAttribute(name, new InstancedBufferAttribute(new Float32Array(instances * each), each).setUsage(DynamicDrawUsage));
   }
   geometry.instanceCount = 0;
-  const material = new ShaderMaterial({
+  const material = new RawShaderMaterial({
     vertexShader: SURFACE_VERTEX, fragmentShader: SURFACE_FRAGMENT, glslVersion: GLSL3, side: DoubleSide, blending: NoBlending,
     uniforms: { ...shared, uStride: { value: stride }, uFan: { value: isFan } }, defines: definesOf(sphere),
   });

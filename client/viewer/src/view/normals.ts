@@ -1,8 +1,8 @@
 // Normals of the range as a texture, drawn by a pass over the rectangles that changed.
 
 import {
-  BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, GLSL3, LinearFilter, Mesh, NoBlending, RepeatWrapping, Scene,
-  ShaderMaterial, Vector2, WebGLRenderTarget,
+  BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, GLSL3, LinearFilter, Mesh, NoBlending, RawShaderMaterial, RepeatWrapping,
+  Scene, Vector2, WebGLRenderTarget,
 } from 'three';
 import type { DataTexture, WebGLRenderer } from 'three';
 import type { Changed } from '../protocol/model.ts';
@@ -41,7 +41,7 @@ export class Normals {
     return this.pass.compile(this.renderer, this.target);
   }
 
-  /** Have the other one compiled, which `fill` takes. */
+  /** Have the other one compiled, that `fill` takes. */
   compileFill(): Promise<void> {
     return this.copy.compile(this.renderer, this.target);
   }
@@ -126,12 +126,12 @@ function targetOf(width: number, height: number): WebGLRenderTarget {
 class Pass {
   private readonly scene = new Scene();
   private readonly camera = new Camera();
-  private readonly quad: Mesh<BufferGeometry, ShaderMaterial>;
+  private readonly quad: Mesh<BufferGeometry, RawShaderMaterial>;
 
   constructor(fragmentShader: string, sphere: boolean, readonly uniforms: Uniforms) {
     const geometry = new BufferGeometry();
     geometry.setAttribute('position', new BufferAttribute(new Float32Array([-1, -1, 0, 3, -1, 0, -1, 3, 0]), 3));
-    const material = new ShaderMaterial({
+    const material = new RawShaderMaterial({
       vertexShader: QUAD_VERTEX, fragmentShader, glslVersion: GLSL3, blending: NoBlending, depthTest: false, depthWrite: false, uniforms,
       defines: definesOf(sphere),
     });

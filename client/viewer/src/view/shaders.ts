@@ -42,12 +42,15 @@ uint stepsAt(int column, int row) {
  */
 export const SURFACE_VERTEX = /* glsl */ `
 ${GRID}
+uniform mat4 projectionMatrix;
+uniform mat4 viewMatrix;
 uniform float uZMaxMm;
 uniform float uTheta0;
 uniform int uStride;
 uniform int uTile;
 uniform bool uFan;
 uniform vec2 uPoles;
+in vec3 position;
 in vec2 tile;
 in vec4 edges;
 out vec2 vUv;
@@ -118,6 +121,7 @@ uniform sampler2D uCoarse;
 uniform sampler2D uDense;
 uniform usampler2D uLevel;
 uniform vec2 uLevelScale;
+uniform vec3 cameraPosition;
 uniform float uZMaxMm;
 uniform float uTheta0;
 uniform vec3 uKey;
@@ -207,6 +211,8 @@ void main() {
 `;
 
 export const QUAD_VERTEX = /* glsl */ `
+in vec3 position;
+
 void main() {
   gl_Position = vec4(position.xy, 0.0, 1.0);
 }

@@ -261,7 +261,12 @@ export class Stage {
   /** Do what the first picture could do without, so that the first look need not wait for it. */
   private async useLeisure(): Promise<void> {
     await this.done();
-    if (await this.surface?.makeReady()) this.draw();
+    const { surface } = this;
+    if (!surface || surface.isReady) return;
+    await this.smallest.get(geometryOf(surface.info))?.compileMore();
+    if (surface !== this.surface || surface.isReady) return;
+    surface.makeReady();
+    this.draw();
   }
 
   /** Draw the smallest surface of a kind, so that programs are there, and the card knows them, before a scan is. */

@@ -42,8 +42,7 @@ export class Surface {
   private readonly coarse: DataTexture;
   private dense: DataTexture;
   private readonly normals: Normals;
-  private isReady = false;
-  private isGone = false;
+  isReady = false;
   private readonly uniforms: Uniforms;
 
   constructor(
@@ -83,16 +82,17 @@ export class Surface {
     await Promise.all([compile(this.renderer, this.object, camera), this.normals.compile()]);
   }
 
-  /** Do what the first picture could do without, so that the first look need not wait for it. Returns whether it shows. */
-  async makeReady(): Promise<boolean> {
-    if (this.isReady) return false;
+  /** Have the program compiled that `makeReady` takes. */
+  compileMore(): Promise<void> {
+    return this.normals.compileFill();
+  }
+
+  /** Do what the first picture could do without, so that the first look need not wait for it. */
+  makeReady(): void {
     this.isReady = true;
-    await this.normals.compileFill();
-    if (this.isGone) return false;
     this.normals.fill();
     // three.js asks the card about uploads once, and waits for the answer.
     this.upload(integers(this.steps.slice(0, 1), 1, 1, 'R16UI'), this.range, 0, 0);
-    return true;
   }
 
   /** Samples from one that is held to the next, at a place. */
@@ -172,7 +172,6 @@ export class Surface {
   }
 
   dispose(): void {
-    this.isGone = true;
     for (const texture of [this.range, ...this.levels, this.coarse, this.dense]) texture.dispose();
     this.normals.dispose();
     for (const mesh of [...this.meshes, ...this.fans]) {
