@@ -109,7 +109,7 @@ export class App {
     this.frame.pictures.append(this.pane.element);
     this.frame.stage.append(this.display.legend);
     this.frame.showAfter(this.pane.pictured);
-    void this.pane.calm.then(() => this.frame.add(...[this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel,
+    void this.pane.pictured.then(() => this.frame.add(...[this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel,
       this.display, this.pins.panel, this.worth, this.cost, this.about].map(({ element }) => element)));
     addEventListener('hashchange', () => this.addressChanged());
     addEventListener('online', () => this.tell({ kind: 'retry' }));
@@ -168,7 +168,7 @@ export class App {
       this.node = link.node;
       this.allow(link.role !== 'view');
     }
-    void this.pane.calm.then(() => Promise.all([this.refreshScans(), this.refreshCapture()]));
+    void this.pane.pictured.then(() => Promise.all([this.refreshScans(), this.refreshCapture()]));
   }
 
   /** Show what who looks may do, and nothing that the node would refuse. */
@@ -188,7 +188,7 @@ export class App {
     this.about.show(info);
     this.showComparison();
     if (framed) this.restoreState(info.id);
-    void this.pane.calm.then(() => this.readMore(info.id));
+    void this.pane.pictured.then(() => this.readMore(info.id));
   }
 
   /** What the address asks for, when it is about this scan; else a clean view of it. */

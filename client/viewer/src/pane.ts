@@ -53,11 +53,9 @@ export class Pane {
   info: ScanInfo | null = null;
   /** Where detail was got, in order. */
   foveae: Place[] = [];
-  /** Kept once a first picture is painted, or none will be soon. */
+  /** Kept once a first picture stands, or none will soon. */
   readonly pictured: Promise<void>;
-  /** The same once the card has drawn it: panels, and what else the page asks for, wait for it. */
-  readonly calm: Promise<void>;
-  private picture!: () => void;
+  private painted!: () => void;
   private looks = 0;
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
@@ -73,9 +71,8 @@ export class Pane {
     assign(canvas, { tabindex: 0, role: 'application', 'aria-label': strings.view.label });
     this.element = h('div', { class: 'picture' }, canvas);
     this.noted = noted ?? this.element;
-    this.pictured = new Promise((resolve) => (this.picture = resolve));
-    this.calm = this.pictured.then(() => this.stage.done());
-    setTimeout(() => this.picture(), PICTURE_MS);
+    this.pictured = new Promise<void>((resolve) => (this.painted = resolve)).then(() => this.stage.done());
+    setTimeout(() => this.painted(), PICTURE_MS);
     this.stage = new Stage(canvas, context, {
       drawn: () => this.drawn(),
       moved: () => this.events.moved(),
@@ -141,7 +138,7 @@ export class Pane {
 
   /** Show nothing. */
   clear(): void {
-    this.picture();
+    this.painted();
     this.info = null;
     delete this.noted.dataset['scan'];
     this.endLook();
@@ -173,7 +170,7 @@ export class Pane {
 
   private drawn(): void {
     this.marks?.update();
-    if (this.info) this.picture();
+    if (this.info) this.painted();
   }
 
   private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {

@@ -34,13 +34,14 @@ def launch(playwright: Playwright) -> Browser:
 
 @contextmanager
 def opened(browser: Browser, address: str, allowed: str = "\0", **options: Any) -> Iterator[Page]:
-    """The page at an address once a scan is drawn; fails afterwards if it complained or asked anybody else.
+    """The page at an address once a scan is drawn and all stands round it; fails afterwards if it complained or asked anybody else.
 
     allowed : what it may complain of.
     """
     with blank(browser, **options) as (page, problems):
         page.goto(address)
         page.wait_for_selector("html[data-scan]", state="attached")
+        page.wait_for_selector("#app:not(.early) aside details", state="attached")  # panels come after the picture
         wait_drawn(page)
         yield page
     unexpected = [problem for problem in problems if allowed not in problem]

@@ -43,10 +43,10 @@ export class Frame {
     );
   }
 
-  /** Show all that is there in one go: each time the browser puts the page together the picture waits. */
+  /** Show nothing but the picture until it stands: each time the browser puts more of the page together it would wait. */
   showAfter(pictured: Promise<void>): void {
-    this.root.style.visibility = 'hidden';
-    void pictured.then(() => (this.root.style.visibility = ''));
+    this.root.classList.add('early');
+    void pictured.then(() => this.root.classList.remove('early'));
   }
 
   /** Put panels beside the picture. */
