@@ -34,9 +34,9 @@ def launch(playwright: Playwright) -> Browser:
 
 @contextmanager
 def opened(browser: Browser, address: str, allowed: str = "\0", **options: Any) -> Iterator[Page]:
-    """The page at an address once a scan is drawn and all stands round it; fails afterwards if it complained or asked anybody else.
+    """The page at an address once a scan is drawn and all stands round it.
 
-    allowed : what it may complain of.
+    Fails afterwards if it complained or asked anybody else. allowed : what it may complain of.
     """
     with blank(browser, **options) as (page, problems):
         page.goto(address)
