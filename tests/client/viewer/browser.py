@@ -25,6 +25,17 @@ WAIT_MS = 20_000
 AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
 FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
 Picture = NDArray[np.float64]
+SEEN = """async () => {
+  const frames = () => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+  await frames();
+  for (const gl of [...document.querySelectorAll('.picture > canvas')].map((canvas) => canvas.getContext('webgl2'))) {
+    const fence = gl?.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl?.flush();
+    const isDone = () => !fence || gl.isContextLost() || gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED;
+    while (!isDone()) await new Promise((look) => setTimeout(look, 5));
+  }
+  await frames();
+}"""
 
 
 def launch(playwright: Playwright) -> Browser:
@@ -68,8 +79,8 @@ def _is_local(url: str) -> bool:
 
 
 def wait_drawn(page: Page) -> None:
-    """Until what is known is on the screen: two frames after now."""
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))")
+    """Until what is known is on the screen: two frames after now, and two after the card has drawn them."""
+    page.evaluate(SEEN)
 
 
 def wait_updates(page: Page, count: int) -> None:
