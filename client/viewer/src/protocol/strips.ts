@@ -20,7 +20,7 @@ export function buildStrips(shape: ChannelShape, p: Parameters): Lattice[] {
   const y = axisY(shape, p);
   const [owns, strides] = [2, p.halfSpacing].map((half) => ringStrides(shape.width, shape.height, blockSide(shape), half));
   const allowed = STRIDE_SETS[p.strides ?? 0]!;
-  const strideOf = (block: number) => allowed.findLast((stride) => stride <= strides![block]!)!;
+  const strideOf = (block: number) => allowed.filter((stride) => stride <= strides![block]!).at(-1)!;
   const strips: Lattice[] = [];
   for (let begin = 0, end = 0; begin < y.block.length; begin = end) {
     const stride = strideOf(y.block[begin]!);
