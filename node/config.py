@@ -7,6 +7,7 @@ settings come in, in `load_config`; sections are frozen from then on.
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from drivers.address import check_address
-from node.sealed import OPEN_IT, is_shut
+from node.sealed import why_shut
 from protocol.errors import ConfigError, UsageError
 
 FILE_MAX_BYTES = 65536
@@ -123,18 +124,25 @@ class Library(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def path(self) -> Path:
-        """The folder, with ~ expanded. Raises ConfigError as `place` does, and while it is sealed and not open."""
-        if is_shut(self.place):
-            raise ConfigError(f"library.folder: {self.place} is sealed and not open: {OPEN_IT}")
-        return self.place
+        """The folder, absolute and without links. Raises ConfigError as `place` does, and while it is sealed and shut."""
+        place = self.place
+        if shut := why_shut(place):
+            raise ConfigError("library.folder: " + ": ".join(shut))
+        return place
 
     @property
     def place(self) -> Path:
-        """The same, also while there is nothing to be read. Raises ConfigError where nobody's home is known."""
+        """The same, also while there is nothing to be read. Raises ConfigError where it can be no library's.
+
+        What lies sealed is beside what a link points to, so that no way in leads around it.
+        """
         try:
-            return Path(self.folder).expanduser()
-        except RuntimeError as problem:
+            place = Path(os.path.realpath(Path(self.folder).expanduser()))
+        except (RuntimeError, ValueError) as problem:  # nobody's home is known; a zero byte
             raise ConfigError(f"library.folder: {problem}; write an absolute path") from problem
+        if not place.name:
+            raise ConfigError(f"library.folder: {place} cannot be a library: name a folder in it")
+        return place
 
 
 class Retention(Struct, frozen=True, forbid_unknown_fields=True):

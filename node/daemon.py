@@ -33,6 +33,7 @@ from node.notify import Beating, Notifier, keep_notified, status_text
 from node.reload import Change, compare
 from node.resume import publish_complete
 from node.right_of_way import RightOfWay
+from node.sealed import finish, leftovers
 from node.serve import NodeServer
 from node.tls import Tls
 from protocol import messages as m
@@ -112,6 +113,8 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
     folder = config.library.path
     library = await asyncio.to_thread(Library, folder, config.first_view.max_bytes)
     stack.callback(library.close)
+    for left in leftovers(folder):
+        log.warning("library: %s was left by a seal or an unseal; stop the node, and %s", left, finish(folder))
     for found in library.found:
         log.warning("library: after the last end: %s", found)
     for problem in library.problems:

@@ -47,7 +47,7 @@ from node.machine import (
     written_last_s,
 )
 from node.scan_folder import name_problems
-from node.sealed import OPEN_IT, is_open, is_shut
+from node.sealed import finish, is_open, leftovers, why_shut
 from node.tls import CREDENTIAL, certificate_file, key_file, read_certificate
 from protocol.errors import AccessError, ConfigError, LibraryError, PortLost
 from protocol.printable import counted
@@ -84,8 +84,11 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     except ConfigError as error:
         yield Finding("configuration", "problem", str(error), "correct the setting named; the rest was not looked at")
         return
-    if is_shut(place):
-        yield Finding("library", "problem", f"{place} is sealed and not open; the rest was not looked at", OPEN_IT)
+    if left := leftovers(place):
+        found = f"left by a seal or an unseal that was cut, if none runs: {', '.join(map(str, left))}"
+        yield Finding("library", "warning", found, f"stop the node, and {finish(place)}")
+    if shut := why_shut(place):
+        yield Finding("library", "problem", f"{shut[0]}; the rest was not looked at", shut[1])
         return
     library = config.library.path
     yield Finding("configuration", "ok", str(path) if path else "the defaults: no file was named")

@@ -11,7 +11,9 @@ The key is one line of text; nothing of it is kept here.
 
 from __future__ import annotations
 
+import errno
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -32,6 +34,8 @@ NEW_KEY = "head -c 32 /dev/urandom | base64 -w0"
 STRETCH = "10"  # the least: a key is random, and nothing is won by making its trial slow
 MOUNT_S = 30.0
 OPEN_IT = "systemctl start foveascan-vault, or mount it (README, \"A sealed library\")"
+OPEN_AGAIN = "systemctl restart foveascan-vault, or umount it and mount it again (README, \"A sealed library\")"
+LEFT = "away", "gone", "sealing", "coming"
 WRONG_KEY = 12  # gocryptfs's status
 _ESCAPED = {"\\040": " ", "\\011": "\t", "\\012": "\n", "\\134": "\\"}
 
@@ -48,7 +52,12 @@ def beside(folder: Path, word: str) -> Path:
 
 def is_sealed(folder: Path) -> bool:
     """Whether a library lies sealed on the disk."""
-    return (sealed_folder(folder) / CONF).exists()
+    return is_kept(sealed_folder(folder))
+
+
+def is_kept(sealed: Path) -> bool:
+    """Whether a folder is one that a key may open."""
+    return (sealed / CONF).exists()
 
 
 def is_open(folder: Path) -> bool:
@@ -66,8 +75,40 @@ def is_open(folder: Path) -> bool:
 
 def is_shut(folder: Path) -> bool:
     """Whether a library is sealed and not open, so that whatever is written here would lie in the clear beside it."""
-    begun = any(beside(folder, word).exists() for word in ("away", "gone"))
-    return (begun or is_sealed(folder)) and not is_open(folder)
+    return (_is_cut(folder) or is_sealed(folder)) and not is_open(folder)
+
+
+def why_shut(folder: Path) -> tuple[str, str] | None:
+    """What keeps a sealed library from being read, and the cure; None where it is open, or not sealed.
+
+    Raises OSError.
+    """
+    if is_shut(folder):
+        if _is_cut(folder):
+            return f"{folder} was being sealed or unsealed when that was cut", f"stop the node, and {finish(folder)}"
+        return f"{folder} is sealed and not open", OPEN_IT
+    if is_open(folder):
+        try:
+            os.statvfs(folder)  # asks it, where attributes may be remembered
+        except OSError as error:
+            if error.errno == errno.ENOTCONN:
+                return f"what had opened {folder}, which is sealed, has died", OPEN_AGAIN
+    return None
+
+
+def _is_cut(folder: Path) -> bool:
+    return any(beside(folder, word).exists() for word in ("away", "gone"))
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """What a seal or an unseal that was cut has left beside a library; also what one has that runs."""
+    return [place for word in LEFT if (place := beside(folder, word)).exists()]
+
+
+def finish(folder: Path) -> str:
+    """The command that ends what was cut."""
+    verb = "unseal" if any(beside(folder, word).exists() for word in ("gone", "coming")) else "seal"
+    return shlex.join(["foveascan", "library", verb, "--library", str(folder), "--key", "FILE"])
 
 
 def holds_something(folder: Path) -> bool:

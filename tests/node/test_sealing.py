@@ -103,12 +103,35 @@ def test_sealed_it_cannot_be_read_and_open_it_is_the_same(folder: Path, tmp_path
 
 def test_a_library_that_is_not_there_yet_is_sealed_from_its_first_scan_on(tmp_path: Path) -> None:
     folder = tmp_path / "library"
+    with pytest.raises(LibraryError, match="there is no folder .*library: name the library's, or make one"):
+        seal(folder, KEY, ignore)
+    assert not list(tmp_path.iterdir())
+    folder.mkdir()
     seal(folder, KEY, ignore)
     with open_at(folder):
         library = Library(folder)
         library.add(make_grid(), About(1e9))
         library.close()
     assert list(folder.iterdir()) == []
+
+
+def cut_at(change: Callable[..., None], folder: Path, step: str, at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a seal or an unseal fail at a step that changes the disk. at : how many of that kind are done before."""
+    done = 0
+    owner = shutil if step == "rmtree" else os
+    take = getattr(owner, step)
+
+    def cut(*places: Path) -> None:
+        nonlocal done
+        if done == at:
+            raise OSError(errno.EIO, "cut")
+        done += 1
+        take(*places)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, step, cut)
+        with pytest.raises(LibraryError, match="cut"):
+            change(folder, KEY, ignore)
 
 
 @pytest.mark.parametrize("change", [seal, unseal])
@@ -119,20 +142,7 @@ def test_what_was_cut_goes_on_and_nothing_is_lost(
     before = content(folder)
     if change is unseal:
         seal(folder, KEY, ignore)
-    done = 0
-    take = getattr(shutil if step == "rmtree" else os, step)
-
-    def cut(*places: Path) -> None:
-        nonlocal done
-        if done == at:
-            raise OSError(errno.EIO, "cut")
-        done += 1
-        take(*places)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(shutil if step == "rmtree" else os, step, cut)
-        with pytest.raises(LibraryError, match="cut"):
-            change(folder, KEY, ignore)
+    cut_at(change, folder, step, at, monkeypatch)
     if not is_shut(folder):  # then it is as it was, and may be used meanwhile
         assert content(folder) == before
         (folder / "access" / "access.json").write_text("changed meanwhile")
@@ -146,6 +156,85 @@ def test_what_was_cut_goes_on_and_nothing_is_lost(
         unseal(folder, KEY, ignore)
     assert content(folder) == before
     assert [path.name for path in folder.parent.iterdir()] == ["library"]
+
+
+@pytest.mark.parametrize("change", [seal, unseal])
+@pytest.mark.parametrize("other", [seal, unseal])
+@pytest.mark.parametrize(("step", "at"), [("replace", 2), ("rename", 0), ("rename", 1), ("rmtree", 0)])
+def test_either_command_ends_what_was_cut_and_only_with_its_key(
+    folder: Path,
+    change: Callable[..., None],
+    other: Callable[..., None],
+    step: str,
+    at: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = content(folder)
+    if change is unseal:
+        seal(folder, KEY, ignore)
+    cut_at(change, folder, step, at, monkeypatch)
+    lies = content(folder.parent)
+    with pytest.raises(LibraryError, match="does not open the library"):
+        other(folder, OTHER, ignore)
+    assert content(folder.parent) == lies
+    other(folder, KEY, ignore)
+    names = sorted(path.name for path in folder.parent.iterdir())
+    if other is seal:
+        assert names == ["library", "library.sealed"] and not list(folder.iterdir())
+        unseal(folder, KEY, ignore)
+    else:
+        assert names == ["library"]
+    assert content(folder) == before
+
+
+@pytest.mark.parametrize(("change", "left"), [(seal, "away"), (unseal, "gone")])
+def test_a_copy_is_not_deleted_while_it_is_the_only_one(
+    folder: Path, change: Callable[..., None], left: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if change is unseal:
+        seal(folder, KEY, ignore)
+    cut_at(change, folder, "rmtree", 0, monkeypatch)
+    away, place = beside(folder, left), folder if change is seal else sealed_folder(folder)
+    before = content(away)
+    shutil.rmtree(sealed_folder(folder) if change is seal else folder)
+    for again in seal, unseal:
+        with pytest.raises(LibraryError, match=f"the library is in {away}: mv -T {away} {place}$"):
+            again(folder, KEY, ignore)
+    assert os.system(f"mv -T {away} {place}") == 0
+    assert content(place) == before
+
+
+def test_a_clear_copy_that_was_left_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut_at(seal, folder, "rmtree", 0, monkeypatch)
+    again = f"stop the node, and foveascan library seal --library {folder} --key FILE"
+    overrides = {"library.folder": str(folder)}
+    [left, shut] = examine(None, overrides)
+    assert (left.state, left.cure) == ("warning", again) and str(beside(folder, "away")) in left.found
+    assert (shut.state, shut.cure) == ("problem", again)
+    with pytest.raises(ConfigError, match="was being sealed or unsealed when that was cut"):
+        _ = load_config(overrides=overrides).library.path
+    with open_at(folder):
+        assert next(iter(examine(None, overrides))) == left
+    seal(folder, KEY, ignore)
+    [shut] = examine(None, overrides)
+    assert "vault" in shut.cure
+
+
+def test_a_link_leads_to_the_same_library(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, key, link = content(folder), tmp_path / "key", tmp_path / "link"
+    key.write_bytes(KEY)
+    link.symlink_to(folder)
+    monkeypatch.chdir(folder)
+    assert run("seal", "--library", link, "--key", key) == 0
+    assert link.is_symlink() and is_sealed(folder)
+    monkeypatch.chdir(folder)
+    for way in link, ".":
+        with pytest.raises(ConfigError, match=f"{folder} is sealed and not open"):
+            run("list", "--library", way)
+    assert run("unseal", "--library", ".", "--key", key) == 0
+    assert content(folder) == before
+    with pytest.raises(ConfigError, match=r"library.folder: / cannot be a library"):
+        run("seal", "--library", "/", "--key", key)
 
 
 @pytest.mark.parametrize("verb", ["seal", "unseal"])
@@ -296,7 +385,11 @@ def test_a_vault_that_dies_loses_nothing_that_was_kept(folder: Path) -> None:
             library.annotate(kept, Changes(name="x"), "ana")
         library.close()
         with pytest.raises(LibraryError, match="cannot be used: Transport endpoint is not connected"):
-            Library(load_config(overrides={"library.folder": str(folder)}).library.path)
+            Library(folder)
+        with pytest.raises(ConfigError, match="which is sealed, has died: systemctl restart foveascan-vault"):
+            run("list", "--library", folder)
+        [finding] = examine(None, {"library.folder": str(folder)})
+        assert finding.state == "problem" and "foveascan-vault" in finding.cure
     with open_at(folder):
         library = Library(folder)
         assert [problem for _, problem in library.verify()] == [None]
