@@ -124,7 +124,7 @@ class Library(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def path(self) -> Path:
-        """The folder, absolute and without links. Raises ConfigError as `place` does, and while it is sealed and shut."""
+        """The folder, absolute and without links. Raises ConfigError as `place` does, and while it is shut."""
         place = self.place
         if shut := why_shut(place):
             raise ConfigError("library.folder: " + ": ".join(shut))
