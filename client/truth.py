@@ -10,7 +10,7 @@ import numpy as np
 
 from client.model import Model
 from exchange.native import read_native
-from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, BoolArray, Geometry, ImageArray, StepArray
+from protocol.grid import RANGE_BLOCK, TEXTURE_BLOCK, BoolArray, FloatArray, Geometry, ImageArray, IntArray, StepArray
 from protocol.region import region_round
 from protocol.rings import ring_strides
 from protocol.sphere import cap_region
@@ -75,8 +75,9 @@ class Truth:
     def _psnr_db(self, model: Model, u: float, v: float, window: float) -> float:
         height, width = self.texture.shape[:2]
         inside = self._inside(u, v, window, height, width, TEXTURE_BLOCK)
-        held, true = model.texture[inside], self.texture[inside]
-        squared = float(np.mean((held.astype(np.float64) - true) ** 2))
+        missed = np.mean((model.texture[inside].astype(np.float64) - self.texture[inside]) ** 2, axis=-1)
+        area = np.broadcast_to(self._area(width, height)[:, None], inside.shape)[inside]
+        squared = float(np.average(missed, weights=area))
         return PSNR_MAX_DB if squared == 0 else min(10 * math.log10(255**2 / squared), PSNR_MAX_DB)
 
     def _inside(self, u: float, v: float, window: float, height: int, width: int, side: int) -> BoolArray:
@@ -85,5 +86,16 @@ class Truth:
             region = region_round(u, v, window, width, height)
             return region.inside(np.arange(height), np.arange(width))
         inside = cap_region(u, v, window, width, height).inside(np.arange(height), np.arange(width))
-        stride = np.repeat(ring_strides(width, height, side), side)[:height]
-        return np.asarray(inside & (np.arange(width) % stride[:, None] == 0))
+        return np.asarray(inside & (np.arange(width) % _strides(width, height, side)[:, None] == 0))
+
+    def _area(self, width: int, height: int) -> FloatArray:
+        """Of a texel of its own in each row, in texels of the equator. (height,)"""
+        if self.geometry == "cylinder":
+            return np.ones(height)
+        narrow = np.sin(np.pi * (np.arange(height) + 0.5) / height)
+        return np.asarray(_strides(width, height, TEXTURE_BLOCK) * narrow, np.float64)
+
+
+def _strides(width: int, height: int, side: int) -> IntArray:
+    """How many columns a sample of its own is wide in each row of a sphere. (height,)"""
+    return np.asarray(np.repeat(ring_strides(width, height, side), side)[:height])

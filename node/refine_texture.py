@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -16,18 +17,18 @@ from node.sample import texture_samples
 from node.state import ClientState
 from node.texture_model import SPACINGS, TextureModel
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
-from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray, IntArray
+from protocol.grid import TEXTURE_BLOCK, BoolArray, FloatArray, ImageArray, IntArray
 from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
 from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, mask_to_runs
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
-from protocol.rings import ring_strides
 from protocol.strips import Strips, blocks_of, build_strips, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
 NEVER = 1 << 16  # a quality that there is not
+HELD_MARGIN = 0.95  # what is held is known block by block, not value by value
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -196,11 +197,12 @@ def left_alone(state: ClientState, coded: Coded | None, region: Region) -> BoolA
 
 
 def held_error(
-    state: ClientState, kept: BoolArray, region: Region, model: TextureModel | None, target_mse: float
-) -> tuple[float, int]:
+    state: ClientState, kept: BoolArray, region: Region, model: TextureModel | None, target_mse: float, *, most: bool
+) -> tuple[float, float]:
     """Squared error in some of a region's blocks as they are held, and of how many values.
 
-    kept : which, (rows, columns) of Region.blocks.
+    kept : which, (rows, columns) of Region.blocks.   most : so much it may be; else what is to be expected, since
+    errors are known block by block, not value by value.
     Blocks that were never measured count as the model expects them, or as just good enough without one.
     """
     if not kept.any():
@@ -215,8 +217,13 @@ def held_error(
     elif unknown.any():
         quality = state.holdings.channels[Channel.TEXTURE].rank[rows, across].astype(np.int64) - 1
         mse[unknown] = model.mse_at(rows[unknown], across[unknown], quality[unknown])
-    inside = _values_inside(state.shapes[Channel.TEXTURE], region, rows, across)
-    return float(inside @ mse), int(inside.sum())
+    shape = state.shapes[Channel.TEXTURE]
+    inside = _values_inside(shape, region, rows, across)
+    error = float(inside @ mse)
+    if most:
+        beyond = np.maximum(mse - target_mse, 0.0)  # of a block that is cut, all of it may lie inside
+        error = float(error + (_values_of(shape, rows, across) - inside) @ beyond) / HELD_MARGIN
+    return error, float(inside.sum())
 
 
 def quality_needed(state: ClientState, region: Region, p: float) -> IntArray:
@@ -245,18 +252,42 @@ def _place(blocks: tuple[int, ...], region: Region) -> tuple[IntArray, IntArray]
     return rows, columns
 
 
-def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> IntArray:
-    """How many of each block's own values lie in a region; of a cap's all that are in its blocks."""
+def _values_of(shape: ChannelShape, rows: IntArray, columns: IntArray) -> FloatArray:
+    """How many values each block has, those of the equator's size."""
+    high = np.minimum(TEXTURE_BLOCK, shape.height - rows * TEXTURE_BLOCK)
+    wide = np.minimum(TEXTURE_BLOCK, shape.width - columns * TEXTURE_BLOCK)
+    narrow = np.sin(np.pi * (rows * TEXTURE_BLOCK + high / 2) / shape.height) if shape.sphere else 1.0
+    return np.asarray(3.0 * high * wide * narrow)
+
+
+def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> FloatArray:
+    """How many of each block's values lie in a region."""
+    if shape.sphere:
+        return np.asarray(_share_inside(region, shape)[rows, columns] * _values_of(shape, rows, columns))
     top, left = rows * TEXTURE_BLOCK, columns * TEXTURE_BLOCK
     bottom = np.minimum(top + TEXTURE_BLOCK, shape.height)
     size = np.minimum(TEXTURE_BLOCK, shape.width - left)
-    if shape.sphere:
-        stride = ring_strides(shape.width, shape.height, TEXTURE_BLOCK)[rows]
-        return np.asarray(3 * (bottom - top) * (size // stride), np.int64)
     height = np.minimum(bottom, region.top + region.height) - np.maximum(top, region.top)
     across = (left[:, None] + np.arange(TEXTURE_BLOCK) - region.left) % region.turn < region.width
     width = (across & (np.arange(TEXTURE_BLOCK) < size[:, None])).sum(axis=1)
-    return np.asarray(3 * np.maximum(height, 0) * width, np.int64)
+    return np.asarray(3.0 * np.maximum(height, 0) * width)
+
+
+@lru_cache(maxsize=16)
+def _share_inside(region: Region, shape: ChannelShape) -> FloatArray:
+    """Which share of each block of a texture lies in a region. (rows, columns) of all blocks"""
+    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
+    turn, columns = divmod(left + np.arange(wide), shape.blocks[1])
+    starts = turn * shape.width + columns * TEXTURE_BLOCK  # not wrapped
+    sizes = np.minimum(TEXTURE_BLOCK, shape.width - columns * TEXTURE_BLOCK)
+    rows = np.arange(top * TEXTURE_BLOCK, min((top + high) * TEXTURE_BLOCK, shape.height))
+    inside = region.inside(rows, np.arange(starts[0], starts[-1] + sizes[-1])).astype(np.int64)
+    across = np.add.reduceat(inside, starts - starts[0], axis=1)
+    counts = np.add.reduceat(across, np.arange(0, rows.size, TEXTURE_BLOCK), axis=0)
+    heights = np.minimum(TEXTURE_BLOCK, shape.height - (top + np.arange(high)) * TEXTURE_BLOCK)
+    share = np.zeros(shape.blocks)
+    share[_place(shape.blocks, region)] = counts / np.multiply.outer(heights, sizes)
+    return share
 
 
 def mse_of_db(db: float) -> float:

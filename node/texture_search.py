@@ -17,6 +17,7 @@ from node.library import Scan
 from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
     CODECS,
+    HELD_MARGIN,
     adopted_error,
     choose_spacing,
     code_texture_lattice,
@@ -41,7 +42,6 @@ from protocol.region import Region
 SKIRT_S = 1.0
 GRAINS = {"htj2k": 1 / SIXTEENTHS, "jpeg": 1.0}  # by how much qualities of a codec can differ
 WHOLE_SHARE = 0.7  # of what a whole window takes: where a part takes more, the whole is tried too
-HELD_MARGIN = 0.95  # what is held is known block by block, not texel by texel
 FINEST_SHARE = 1.03  # of what another spacing takes: up to there spacing 1 is preferred
 POOR = (1, 2, 4, 16)  # times the error allowed: blocks that are held no better may be sent again
 SPOILT_SHARE = 0.6  # of the error allowed: blocks that stay may take so much of what those that are sent may have
@@ -116,12 +116,15 @@ class TextureSearch:
         found = self._search_spacings(aim_bytes, limit_bytes, listed)
         if listed is None or found is None or found.wire_bytes < WHOLE_SHARE * self._expected_whole_bytes():
             return found
-        reached = self.mse
+        reached = self._left()
         whole = self._search_spacings(aim_bytes, limit_bytes, None)  # one quality all over may cost less than parts do
-        if whole is not None and whole.wire_bytes < found.wire_bytes:
+        if whole is not None and whole.wire_bytes < found.wire_bytes and self._left() <= max(reached, self._target_mse):
             return whole
-        self.mse = reached
+        self.mse = reached if math.isfinite(reached) else None
         return found
+
+    def _left(self) -> float:
+        return math.inf if self.mse is None else self.mse
 
     def _listing(self, aim_bytes: float) -> tuple[int, ...] | None:
         """Which blocks to send: those that are not good enough, or fewer and these better, or all (None)."""
@@ -280,11 +283,12 @@ class TextureSearch:
         total, count = 0.0, 0.0
         if coded is not None:
             total, count = adopted_error(self._scan, coded, self._region)
-        held_total, held_count = self._held_error(left_alone(self._state, coded, self._region))
+        kept = left_alone(self._state, coded, self._region)
+        held_total, held_count = self._held_error(kept, most=coded is not None)
         return (total + held_total) / max(count + held_count, 1)
 
-    def _held_error(self, kept: BoolArray) -> tuple[float, int]:
-        return held_error(self._state, kept, self._region, self._model, self._target_mse)
+    def _held_error(self, kept: BoolArray, *, most: bool = True) -> tuple[float, float]:
+        return held_error(self._state, kept, self._region, self._model, self._target_mse, most=most)
 
     def _learn(self, p: int, coded: Coded) -> None:
         """Tell the model what a refinement took, where a skirt is not what took it."""

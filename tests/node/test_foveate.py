@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from client.model import Model
@@ -331,6 +331,7 @@ def test_a_click_beside_a_held_window_costs_what_is_new(scan: Scan, view: FirstV
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(places, places, st.sampled_from([0.02, 0.05, 0.1, 0.3])), min_size=2, max_size=5))
+@example([(0.0, 0.0, 0.02), (0.8125, 0.0, 0.02), (0.90625, 0.0, 0.02)])  # held blocks are cut by the window's edge
 def test_overlapping_windows_reach_their_quality_too(
     scan: Scan, view: FirstView, model_of_texture: TextureModel, looks: list[tuple[float, float, float]]
 ) -> None:
