@@ -11,16 +11,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 import pytest
 
 from node.config import load_config
+from node.daemon import start_node
 from node.doctor import examine
 from node.journal import Journals
 from node.library import About, Library, survey, verify
 from node.library_command import add_library_command
-from node.sealed import NEW_KEY, beside, is_open, is_sealed, is_shut, read_key, sealed_folder
+from node.sealed import NEW_KEY, beside, is_open, is_sealed, is_shut, opened, read_key, sealed_folder
 from node.sealing import rekey, seal, unseal
 from node.sidecar import Changes
 from protocol.errors import ConfigError, LibraryError
@@ -218,6 +220,52 @@ def test_a_clear_copy_that_was_left_is_named(folder: Path, monkeypatch: pytest.M
     seal(folder, KEY, ignore)
     [shut] = examine(None, overrides)
     assert "vault" in shut.cure
+
+
+async def test_a_node_that_starts_names_what_was_left(
+    folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut_at(seal, folder, "replace", 2, monkeypatch)
+    settings = {"server.listen": "127.0.0.1:0", "server.insecure": True, "discovery.enabled": False}
+    async with AsyncExitStack() as stack:
+        await start_node(load_config(overrides={"library.folder": str(folder), **settings}), stack)
+    assert f"{beside(folder, 'sealing')} was left by a seal or an unseal; stop the node, and foveascan" in caplog.text
+
+
+@pytest.mark.parametrize("change", [seal, unseal])
+def test_a_copy_that_changed_since_it_was_compared_is_compared_again(
+    folder: Path, change: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = content(folder)
+    if change is unseal:
+        seal(folder, KEY, ignore)
+    cut_at(change, folder, "rename", 1, monkeypatch)
+    if change is seal:
+        with opened(beside(folder, "sealing"), beside(folder, "open"), KEY) as place:
+            (place / "access" / "access.json").unlink()
+        seal(folder, KEY, ignore)
+    else:
+        (beside(folder, "coming") / "access" / "access.json").unlink()
+    unseal(folder, KEY, ignore)
+    assert content(folder) == before
+
+
+@pytest.mark.parametrize(("change", "left"), [(seal, "away"), (unseal, "gone")])
+def test_of_two_that_may_be_wanted_neither_is_deleted(
+    folder: Path, change: Callable[..., None], left: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if change is unseal:
+        seal(folder, KEY, ignore)
+    cut_at(change, folder, "rmtree", 0, monkeypatch)
+    if change is seal:
+        (folder / "written").write_text("meanwhile")
+    else:
+        shutil.copytree(beside(folder, left), sealed_folder(folder))
+    before = content(folder.parent)
+    for again in seal, unseal:
+        with pytest.raises(LibraryError, match="move away the one that is not wanted"):
+            again(folder, KEY, ignore)
+    assert content(folder.parent) == before
 
 
 def test_a_link_leads_to_the_same_library(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
