@@ -75,6 +75,7 @@ def test_nothing_complete_is_lost_and_nothing_partial_stays(worker: subprocess.P
 
 def test_a_sealed_library_loses_no_more(worker: subprocess.Popen[str], tmp_path: Path) -> None:
     require_mounts()
+    (tmp_path / "library").mkdir()
     seal(tmp_path / "library", KEY, lambda size_bytes: None)
     with open_at(tmp_path / "library"):
         work_and_cut(worker, tmp_path / "library", tmp_path, ROUNDS_SEALED)

@@ -240,8 +240,10 @@ def test_an_update_runs_and_one_that_does_not_come_up_leaves_what_was_running(ma
 def test_a_library_is_sealed_by_the_commands_of_the_readme(machine: Machine, port: int) -> None:
     require_mounts()
     before, vault = scans(machine, port), "foveascan-vault"
-    block = (ROOT / "README.md").read_text().partition("\n## A sealed library\n")[2].partition("\n    ")[2]
-    apt, *commands = [line.strip() for line in block.partition("\n\n")[0].splitlines()]
+    section = (ROOT / "README.md").read_text().partition("\n## A sealed library\n")[2].partition("\nFrom then on")[0]
+    apt, *commands = [line.strip() for line in section.splitlines() if line.startswith("    ")]
+    store, seal = (next(at for at, line in enumerate(commands) if what in line) for what in ("creds encrypt", " seal "))
+    assert store < seal  # else a machine that goes off in between has nothing but what nobody can open
     assert apt == "apt-get install gocryptfs fuse3"
     machine.run("sh", "-c", "set -e\n" + "\n".join(commands))
     machine.await_property("ActiveState", "active")
