@@ -9,6 +9,7 @@ may be another one, so it counts no longer, and every scan says so until somebod
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from protocol.errors import LibraryError
 log = logging.getLogger(__name__)
 
 FILE = "axes.json"
+SPOILT = FILE + ".damaged"  # what could not be read is kept, as it may have been of other scanners
 FORMAT = 1
 FILE_BYTES_MAX = 1 << 17
 SCANNERS_MAX = 64  # the one calibrated longest ago makes room
@@ -61,7 +63,8 @@ class Axes:
         self._path = library / FILE
         self._lock = threading.Lock()
         self._known: dict[str, KnownAxis] = {}
-        self._trouble = ""
+        self._trouble = self._told_of_spoilt()
+        self._is_spoilt = False
         try:
             self._path.with_name(FILE + NEW).unlink(missing_ok=True)
             kept = decode_kept(read_bounded(self._path, FILE_BYTES_MAX), _Kept, f"its {FILE}")
@@ -71,7 +74,8 @@ class Axes:
         except FileNotFoundError:
             pass
         except (OSError, LibraryError) as error:
-            self._trouble = "not corrected for the scanner's axis, as axes.json cannot be read: calibrate again"
+            self._is_spoilt = True
+            self._trouble = f"not corrected for the scanner's axis, as {FILE} cannot be read: calibrate again"
             log.warning("%s (%s)", self._trouble, error)
 
     def known(self) -> tuple[KnownAxis, ...]:
@@ -105,7 +109,16 @@ class Axes:
 
     def _write(self, axes: list[KnownAxis]) -> None:
         try:
+            if self._is_spoilt:
+                os.replace(self._path, self._path.with_name(SPOILT))
+                self._is_spoilt = False
             write_whole(self._path, msgspec.json.format(msgspec.json.encode(_Kept(FORMAT, tuple(axes)))))
         except OSError as error:
             raise disk_error("cannot keep the scanner's axis", error) from error
-        self._known, self._trouble = {known.scanner: known for known in axes}, ""
+        self._known, self._trouble = {known.scanner: known for known in axes}, self._told_of_spoilt()
+
+    def _told_of_spoilt(self) -> str:
+        """What is said of sweeps by scanners that are not known, while a file lies there that may have known them."""
+        if not self._path.with_name(SPOILT).exists():
+            return ""
+        return f"not corrected for the scanner's axis, if {SPOILT} knew it: calibrate, or delete that file"

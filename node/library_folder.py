@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 
 from node.axes import FILE as AXES
+from node.axes import SPOILT
 from node.durable import NEW, decode_kept, disk_error, read_bounded, sync_folder, write_whole
 from node.scan_folder import INCOMING, RANGE_FILE, RECORD_FILE, REPAIRS_FILE, SCAN_ID, TEXTURE_FILE
 from node.sidecar import FILE as SIDECAR_FILE
@@ -27,7 +28,7 @@ from protocol.errors import LibraryError
 
 FORMAT = 1
 MARK_FILE, LOCK_FILE, SWEEPS = "library.json", "lock", "sweeps"
-OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, AXES, "node-id", "access", "audit"})  # those of node.identity, too
+OWN = frozenset({MARK_FILE, LOCK_FILE, SWEEPS, AXES, SPOILT, "node-id", "access", "audit"})  # of other modules, too
 TRASH, RESTORE = ".trash-", ".restore-"
 UNFINISHED = (INCOMING, TRASH, RESTORE)
 CHECKED = "checked"  # in a .restore- folder: everything in it was unpacked and found sound

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from node.axes import FILE, SCANNERS_MAX, Axes
+from node.axes import FILE, SCANNERS_MAX, SPOILT, Axes
 from node.durable import NEW
 from node.library import Library
 from protocol.errors import LibraryError
@@ -79,6 +79,11 @@ def test_a_damaged_file_stops_no_node_and_is_told_with_every_scan(tmp_path: Path
     assert axis is None and "axes.json cannot be read: calibrate again" in trouble
     axes.keep(KNOWN)
     assert axes.of("SIM-0001", KNOWN.settings) == (FOUND.axis, "") and json.loads(path.read_text())["format"] == 1
+    assert path.with_name(SPOILT).read_text() == damage(sound), "other scanners may stand in it"
+    for again in (axes, Axes(tmp_path)):
+        assert "if axes.json.damaged knew it" in again.of("OTHER", 1)[1]
+    path.with_name(SPOILT).unlink()
+    assert Axes(tmp_path).of("OTHER", 1) == (None, "")
 
 
 def test_what_cannot_be_written_changes_nothing(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import { Keeping } from './keeping.ts';
 export type Words = typeof strings;
 
 const LOOK_MS = 5000;
+const [LOOKING, ASKED] = ['looking', 'asked'];
 
 export class Admin {
   private readonly element: HTMLDialogElement;
@@ -17,6 +18,7 @@ export class Admin {
   private readonly logins: Logins;
   private readonly log: Log;
   private readonly trouble = h('p', { class: 'trouble', role: 'alert', hidden: true });
+  private failed = '';
   private looking: ReturnType<typeof setInterval> | undefined;
 
   constructor(private readonly words: Words) {
@@ -35,10 +37,10 @@ export class Admin {
   /** Show everything as it is now, and health as it goes on. */
   open(): void {
     this.element.showModal();
-    void this.attempt(() => this.look());
+    void this.attempt(() => this.look(), LOOKING);
     void this.attempt(() => this.logins.refresh());
     void this.attempt(() => this.log.refresh());
-    this.looking = setInterval(() => void this.attempt(() => this.look()), LOOK_MS);
+    this.looking = setInterval(() => void this.attempt(() => this.look(), LOOKING), LOOK_MS);
   }
 
   /** Who may not any more sees nothing of it any more. */
@@ -50,12 +52,13 @@ export class Admin {
     this.keeping.show(await readUpkeep());
   }
 
-  /** Do what may fail, and say how. */
-  private async attempt(work: () => Promise<void>): Promise<void> {
+  /** Do what may fail, and say how, until the same kind of work succeeds. */
+  private async attempt(work: () => Promise<void>, kind = ASKED): Promise<void> {
     try {
       await work();
-      this.trouble.hidden = true;
+      if (this.failed === kind) this.trouble.hidden = true;
     } catch (error) {
+      this.failed = kind;
       this.trouble.textContent = this.words.failed((error as Error).message);
       this.trouble.hidden = false;
     }
