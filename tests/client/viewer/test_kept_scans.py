@@ -218,7 +218,7 @@ def test_two_scans_stand_beside_each_other_and_move_together(browser: Browser, k
         click(page, 0.5, 0.5)
         wait_updates(page, 1)
         page.wait_for_selector('.picture[data-updates="1"][data-looking="no"]')
-        both = settled_fields(page, "fovea", "beside-fovea")
+        both = settled(page, lambda one, other: True, "fovea")
         assert both[0][1] == pytest.approx(both[1][1], abs=0.1), "seen at the same height"
 
         page.get_by_label("Sharpen both").uncheck()
@@ -301,11 +301,13 @@ def test_an_offline_copy_shows_the_same_and_asks_nobody(browser: Browser, kept: 
         page.get_by_text("This file is damaged").wait_for()
 
 
-def settled(page: Page, meant: Callable[[list[float], list[float]], bool]) -> tuple[list[float], list[float]]:
-    """Both cameras as the address has them, once that is what is meant."""
+def settled(
+    page: Page, meant: Callable[[list[float], list[float]], bool], name: str = "camera"
+) -> tuple[list[float], list[float]]:
+    """Both cameras (or another field) as the address has them, once it has both and that is what is meant."""
     until = time.monotonic() + WAIT_MS / 1000
     while time.monotonic() < until:
-        one, other = settled_fields(page, "camera", "beside-camera")
+        one, other = settled_fields(page, name, f"beside-{name}")
         if one and other and meant(one, other):
             return one, other
         page.wait_for_timeout(50)
