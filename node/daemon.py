@@ -28,7 +28,7 @@ from node.identity import node_identity
 from node.library import About, Library, Scan
 from node.live import Live
 from node.log import set_log
-from node.memory import settle
+from node.memory import keep_trimmed, settle
 from node.notify import Beating, Notifier, keep_notified, status_text
 from node.reload import Change, compare
 from node.resume import publish_complete
@@ -89,12 +89,16 @@ async def run_node(config: Config, ready: Callable[[str], None], reread: Callabl
         settle()
         ready(node.url)
         notifier.ready(status_text(node.url, node.capture))
-        telling = asyncio.create_task(keep_notified(notifier, node.url, node.capture, node.parts()))
+        keeping = [
+            asyncio.create_task(keep_notified(notifier, node.url, node.capture, node.parts())),
+            asyncio.create_task(keep_trimmed()),
+        ]
         while await signals.get() is signal.SIGHUP:
             notifier.reloading()
             _reload(node, reread)
             notifier.ready(status_text(node.url, node.capture))
-        telling.cancel()
+        for task in keeping:
+            task.cancel()
         notifier.stopping()
         log.info("stopping")
 

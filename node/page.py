@@ -27,7 +27,7 @@ POLICY = (
     "default-src 'none'; script-src 'self'{wasm}; worker-src 'self'; connect-src 'self'; style-src 'self'; "
     "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-NOT_BUILT = "The page is not built: run `make`, or install the wheel. The command `foveascan look --node {}` works.\n"
+NOT_BUILT = "The page is not built: run `make`, or install the wheel. The command `foveascan look` works anyway.\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Page:
     async def _page(self, request: web.Request) -> web.Response:
         page = self._files.get("index.html")
         if page is None:
-            return web.Response(text=NOT_BUILT.format(request.url.origin()))
+            return web.Response(text=NOT_BUILT)
         return _respond(request, page, ASK_AGAIN)
 
     async def _asset(self, request: web.Request) -> web.Response:

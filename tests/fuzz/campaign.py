@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ GROWN_MB_MAX = 20.0
 DESCRIBED = "openapi"
 TAIL = 2000
 START_S, EACH_S = 600.0, 0.05  # what a target, and a message to it, may take on a machine with other work
+END_S = 20.0  # what one that is told to end may take: it ends its node first
 
 
 def run(names: Sequence[str], count: int, first: int) -> dict[str, Any]:
@@ -32,9 +35,10 @@ def run(names: Sequence[str], count: int, first: int) -> dict[str, Any]:
         if name not in known:
             raise ConfigError(f"bench: no target {name!r}; there are {', '.join(known)}")
     rows = []
-    for name in names or known:
-        rows.append(_apart(name, count, first))
-        print(_line(rows[-1]), file=sys.stderr, flush=True)
+    with _ended_in_order():
+        for name in names or known:
+            rows.append(_apart(name, count, first))
+            print(_line(rows[-1]), file=sys.stderr, flush=True)
     return {"count": count, "seed": first, "rows": rows, "ok": all(row["ok"] for row in rows)}
 
 
@@ -42,16 +46,37 @@ def _apart(name: str, count: int, first: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "tests.fuzz.campaign", name, str(count), str(first)]
     began_s = time.monotonic()
     patience_s = START_S + count * EACH_S * (10 if name == DESCRIBED else 1)  # its requests are made with more thought
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", cwd=ROOT, timeout=patience_s, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return {"target": name, "seconds": patience_s, "ok": False, "found": "did not come to an end"}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", cwd=ROOT
+    ) as program:
+        try:
+            out, err = program.communicate(timeout=patience_s)
+        except subprocess.TimeoutExpired:
+            return {"target": name, "seconds": patience_s, "ok": False, "found": "did not come to an end"}
+        finally:
+            _end(program)
     row = {"target": name, "seconds": time.monotonic() - began_s}
-    if done.returncode:
-        return {**row, "ok": False, "found": f"status {done.returncode}: {done.stderr[-TAIL:]}"}
-    return {**row, **json.loads(done.stdout.splitlines()[-1])}
+    if program.returncode:
+        return {**row, "ok": False, "found": f"status {program.returncode}: {err[-TAIL:]}"}
+    return {**row, **json.loads(out.splitlines()[-1])}
+
+
+@contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """SIGTERM, too, leaves every block on its way out: so what was started here is ended here."""
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _end(program: subprocess.Popen[str]) -> None:
+    program.terminate()
+    try:
+        program.communicate(timeout=END_S)
+    except subprocess.TimeoutExpired:
+        program.kill()
 
 
 def one(name: str, count: int, first: int) -> dict[str, Any]:
@@ -88,4 +113,5 @@ def _line(row: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    print(json.dumps(one(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))))
+    with _ended_in_order():
+        print(json.dumps(one(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))))

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import time
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
+from foveascan import PROGRAM
 from simulators.usb_testbed import PRELOAD, is_available
 from tests.fuzz.campaign import GROWN_MB_MAX
 from tests.fuzz.parsers import targets
@@ -53,3 +60,33 @@ def test_hostile_messages_stop_nobody(port: str) -> None:
     assert record["messages"] >= MESSAGES
     assert record["failures"] == [] and record["served"] > 0
     assert record["grown_mb"] <= GROWN_MB_MAX
+
+
+def test_a_campaign_that_is_ended_ends_its_node() -> None:
+    marker = f"FOVEASCAN_CAMPAIGN={uuid.uuid4()}"
+    name, _, value = marker.partition("=")
+    command = [*PROGRAM, "bench", "fuzz", "--target", "http", "--count", "10000000"]
+    with subprocess.Popen(command, env={**os.environ, name: value}, stderr=subprocess.DEVNULL) as campaign:
+        try:
+            wait_until(lambda: any("serve" in started for started in started_with(marker)))
+        finally:
+            campaign.terminate()
+    assert started_with(marker) == []
+
+
+def started_with(marker: str) -> list[list[str]]:
+    """The arguments of every process with this in its environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is somebody else's
+            if marker.encode() in (folder / "environ").read_bytes():
+                found.append((folder / "cmdline").read_text().split("\0"))
+    return found
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """Wait for it, at most a minute."""
+    until_s = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < until_s
+        time.sleep(0.1)

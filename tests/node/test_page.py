@@ -69,3 +69,5 @@ async def test_nothing_but_built_parts_is_served(dist: Path) -> None:
 async def test_without_a_build_the_page_says_what_to_do(tmp_path: Path) -> None:
     async with client_of(tmp_path) as client:
         assert "run `make`" in await (await client.get("/")).text()
+        answer = await client.get("/", headers={"Host": "127.0.0.1:x"})
+        assert answer.status == 200 and "run `make`" in await answer.text()
