@@ -16,7 +16,7 @@ import re
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
@@ -131,8 +131,10 @@ class Audit:
         return self._done.waiting + self._refused.waiting
 
     def close(self, timeout_s: float = 3.0) -> None:
-        """Write what waits, and end. timeout_s : for both histories; what a slow disk has not taken by then is lost."""
+        """Write what waits, and end. timeout_s : for both histories to be safe from a power cut, too."""
         until_s = time.monotonic() + timeout_s
+        if self._refused.left_out:
+            self._refused.add(entry("stopped", NODE))  # which says how many they were
         for writer in (self._done, self._refused):
             writer.end()
         for writer in (self._done, self._refused):
@@ -146,7 +148,8 @@ class _Writer:
         self._trail = trail
         self._news = threading.Condition()
         self._entries: deque[Entry] = deque()
-        self._left_out = 0
+        self._begun = 0  # of these entries, the first so many are being written
+        self.left_out = 0
         self._is_closing = False
         self._thread: threading.Thread | None = None
         self.trouble = ""
@@ -158,10 +161,10 @@ class _Writer:
     def add(self, one: Entry) -> None:
         with self._news:
             if len(self._entries) >= WAITING_MAX:
-                self._left_out += 1
+                self.left_out += 1
                 return
-            if self._left_out:
-                one, self._left_out = msgspec.structs.replace(one, left_out=self._left_out), 0
+            if self.left_out:
+                one, self.left_out = msgspec.structs.replace(one, left_out=self.left_out), 0
             self._entries.append(one)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
@@ -170,7 +173,7 @@ class _Writer:
 
     def leave_out(self) -> None:
         with self._news:
-            self._left_out += 1
+            self.left_out += 1
 
     def end(self) -> None:
         with self._news:
@@ -180,29 +183,46 @@ class _Writer:
     def wait(self, timeout_s: float) -> None:
         if self._thread is not None:
             self._thread.join(max(timeout_s, 0.0))
-        if self._entries or self._left_out:
-            log.error("audit: %d entries are lost: %s", len(self._entries) + self._left_out, self.trouble or "no time")
+            if self._thread.is_alive():
+                self._hurry()
+                return
+        if self._entries or self.left_out:
+            why = self.trouble or "too many at once"
+            log.error("audit: %d entries are lost: %s", len(self._entries) + self.left_out, why)
+
+    def _hurry(self) -> None:
+        """Write what the thread, which waits for the disk, has not begun."""
+        with self._news:
+            rest = [self._entries.pop() for _ in range(len(self._entries) - self._begun)][::-1]
+            begun = self._begun
+        try:
+            self._trail.append_at_once(_lines(rest))
+        except OSError as error:
+            log.error("audit: %d entries are lost: %s", len(rest), error.strerror or error)
+        log.warning("audit: the disk is slow: a power cut now would lose %d entries", begun + len(rest))
 
     def _run(self) -> None:
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._entries or self._is_closing)
                 batch = list(islice(self._entries, BATCH))
+                self._begun = len(batch)
             if not batch:
                 return
-            if self._write(batch):
-                with self._news:
+            is_written = self._write(batch)
+            with self._news:
+                self._begun = 0
+                if is_written:
                     for _ in batch:
                         self._entries.popleft()
-            elif self._is_closing:
-                return
-            else:
-                with self._news:
+                elif self._is_closing:
+                    return
+                else:
                     self._news.wait_for(lambda: self._is_closing, RETRY_S)
 
     def _write(self, batch: list[Entry]) -> bool:
         try:
-            self._trail.append([msgspec.json.encode(one) for one in batch])
+            self._trail.append(_lines(batch))
         except OSError as error:
             if not self.trouble:
                 log.error("audit: entries cannot be written and wait: %s", error.strerror or error)
@@ -212,6 +232,10 @@ class _Writer:
             log.warning("audit: entries are written again")
             self.trouble = ""
         return True
+
+
+def _lines(entries: Sequence[Entry]) -> list[bytes]:
+    return [msgspec.json.encode(one) for one in entries]
 
 
 def entry(event: Event, who: Who, *, scan: str = "", sweep: str = "", what: str = "") -> Entry:

@@ -31,16 +31,24 @@ class Trail:
 
     def append(self, lines: Sequence[bytes]) -> None:
         """Add lines, all of them or none, durable before this returns. lines : without their ends."""
-        data = b"".join(line + b"\n" for line in lines)
+        data = _joined(lines)
         with self._locked():
             if self._size() and self._size() + len(data) > self._file_bytes_max:
                 self._rotate()
-            handle = os.open(self._path(0), os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            try:
+            with self._opened() as handle:
                 give_to_owner_of(self._folder, self._path(0))
-                _write(handle, data)
-            finally:
-                os.close(handle)
+                size = os.fstat(handle).st_size
+                try:
+                    _write(handle, data)
+                    os.fsync(handle)
+                except OSError:  # of a full disk, say
+                    os.ftruncate(handle, size)
+                    raise
+
+    def append_at_once(self, lines: Sequence[bytes]) -> None:
+        """The same for who cannot wait, neither for others who append nor for the disk: a power cut may lose it."""
+        with self._opened() as handle:
+            _write(handle, _joined(lines))
 
     def newest_first(self) -> Iterator[bytes]:
         """Every line, the last one first. Lines that are added meanwhile may be missing."""
@@ -67,6 +75,14 @@ class Trail:
         sync_folder(self._folder)
 
     @contextmanager
+    def _opened(self) -> Iterator[int]:
+        handle = os.open(self._path(0), os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            yield handle
+        finally:
+            os.close(handle)
+
+    @contextmanager
     def _locked(self) -> Iterator[None]:
         make_private_folder(self._folder)
         lock = self._folder / LOCK_FILE
@@ -79,16 +95,14 @@ class Trail:
             os.close(handle)
 
 
+def _joined(lines: Sequence[bytes]) -> bytes:
+    return b"".join(line + b"\n" for line in lines)
+
+
 def _write(handle: int, data: bytes) -> None:
-    """Append and make durable; on a full disk nothing of it is left."""
     size = os.fstat(handle).st_size
     if size and os.pread(handle, 1, size - 1) != b"\n":
         data = b"\n" + data  # a power cut tore the last line
-    try:
-        written = 0
-        while written < len(data):
-            written += os.write(handle, data[written:])
-        os.fsync(handle)
-    except OSError:
-        os.ftruncate(handle, size)
-        raise
+    written = 0
+    while written < len(data):
+        written += os.write(handle, data[written:])

@@ -1,7 +1,7 @@
 """Hostility on each port: so many mutated messages, while somebody well-behaved is served; memory before and after.
 
-Each port is that of the real daemon, in a process of its own: HTTP, the same with TLS and logins, the stream, a pseudo
-terminal, and USB, where the real libusb meets a device emulated under umockdev. On the scanner's ports an honest
+Each port is that of the real daemon, in a process of its own: HTTP and the stream, without and with TLS and logins, a
+pseudo terminal, and USB, where the real libusb meets a device emulated under umockdev. On the scanner's ports an honest
 scanner comes after the lying one, and a sweep with it has to become a scan.
 """
 
@@ -55,7 +55,8 @@ enabled = false
 [log]
 level = "error"
 """
-PORTS = ("http", "https", "websocket", "serial", "usb")
+WITH_LOGINS = ("https", "wss")
+PORTS = ("http", *WITH_LOGINS, "websocket", "serial", "usb")
 
 
 class Target(NamedTuple):
@@ -123,7 +124,7 @@ def attack(port: str, count: int, first: int) -> dict[str, Any]:
         raise FoveascanError(f"no {PRELOAD} here; as root: apt-get install umockdev libusb-1.0-0")
     with tempfile.TemporaryDirectory(prefix="fs-fuzz-") as name, ExitStack() as stack:  # short: see folder of umockdev
         folder = Path(name)
-        token = _prepare(folder, "true" if port != "https" else "false")
+        token = _prepare(folder, "false" if port in WITH_LOGINS else "true")
         serve = ["serve", "--config", f"{folder}/node.toml", "--json"]
         if port in ("serial", "usb"):
             line: PtyPort | UsbTestbed
@@ -137,7 +138,7 @@ def attack(port: str, count: int, first: int) -> dict[str, Any]:
         else:
             node, ready = stack.enter_context(started(*serve))
             hostility = Hostility(count, first, node.pid)
-            asyncio.run(_attack_network(ready["url"], token if port == "https" else "", port, hostility))
+            asyncio.run(_attack_network(ready["url"], token if port in WITH_LOGINS else "", port, hostility))
         return hostility.record(port, node.poll())
 
 
@@ -208,7 +209,7 @@ async def _attack_network(url: str, token: str, port: str, hostility: Hostility)
         fingerprint = pairing.fingerprint((await look_at_certificate(host, int(number)))[0])
     target = Target(url, token, fingerprint)
     await _warm_up(target, hostility)
-    exchange = attack_stream if port == "websocket" else attack_http
+    exchange = attack_stream if port in ("websocket", "wss") else attack_http
     attackers = [exchange(url, token, random.Random(f"{hostility.first} {n}"), hostility) for n in range(ATTACKERS)]
     await asyncio.gather(_behave_until_done(target, hostility), *attackers)
 

@@ -95,6 +95,38 @@ def test_strangers_push_nothing_out_and_are_counted(tmp_path: Path) -> None:
     assert [one.event for one in done(tmp_path)] == ["opened"]
 
 
+def test_those_who_were_not_written_down_are_counted_at_the_end(tmp_path: Path) -> None:
+    audit = Audit(tmp_path, BYTES_MAX, clock=lambda: 0.0)
+    for number in range(REFUSALS + 7):
+        audit.refuse(Who("nobody", "", f"10.0.{number}.1"), "wrong token")
+    audit.close()
+    refused = [*read_trail(refused_trail(tmp_path))]
+    assert (len(refused), refused[0].event, refused[0].left_out) == (REFUSALS + 1, "stopped", 7)
+
+
+def test_a_disk_that_is_slow_at_the_end_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    is_waiting, may_go_on = threading.Event(), threading.Event()
+
+    def fsync(handle: int) -> None:
+        is_waiting.set()
+        assert may_go_on.wait(60)
+
+    monkeypatch.setattr("node.trail.os.fsync", fsync)
+    audit = Audit(tmp_path, BYTES_MAX)
+    audit.note("opened", ROOM, scan="0")
+    assert is_waiting.wait(60)
+    for scan in "123":
+        audit.note("opened", ROOM, scan=scan)
+    audit.close(timeout_s=0.05)
+    assert [one.scan for one in done(tmp_path)] == ["0", "1", "2", "3"]
+    assert "a power cut now would lose 4 entries" in caplog.text
+    may_go_on.set()
+    until(lambda: audit.waiting == 0)
+    assert [one.scan for one in done(tmp_path)] == ["0", "1", "2", "3"]
+
+
 def test_what_is_wanted_is_found(tmp_path: Path) -> None:
     trail = done_trail(tmp_path, BYTES_MAX)
     for at, by, scan in [("2026-01-01T00:00", "a", "aa11"), ("2026-02-01T00", "b", "aa22"), ("2026-03-01T", "a", "")]:
