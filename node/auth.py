@@ -107,9 +107,12 @@ class Auth:
             return False
 
     def expel(self) -> None:
-        """End the requests of those whose login was revoked. Streams are ended by the server, with a word of it."""
+        """End the requests of those whose login was revoked. Streams are ended by the server, with a word of it.
+
+        But the one that asks for this: who revokes himself hears that it is done.
+        """
         for task, login in self._at_work.items():
-            if not self.stands(login):
+            if task is not asyncio.current_task() and not self.stands(login):
                 log.warning("ended a request whose login was revoked")
                 task.cancel()
 

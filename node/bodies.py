@@ -267,9 +267,10 @@ class ListedCode(_Body, frozen=True):
 
 
 class ListedToken(_Body, frozen=True):
-    """Somebody who is paired. last_used : null where that is not known."""
+    """Somebody who is paired. last_used : null where that is not known.  own : the login of whoever asks."""
 
     name: str
     role: pairing.Role
     created: UnixTime
     last_used: UnixTime | None
+    own: bool

@@ -25,7 +25,7 @@ from aiohttp import web
 from node.access import Access, Token
 from node.attempts import Attempts
 from node.audit import NODE, Audit, Who
-from node.auth import COOKIE, Refusal, asker
+from node.auth import COOKIE, LOGIN, Refusal, asker
 from node.bodies import ListedCode, ListedToken, NewCode, Offered
 from node.endpoints import route
 from node.rest import decoded, refusal, said
@@ -50,10 +50,10 @@ PAGE = """<!doctype html>
 code{{overflow-wrap:anywhere}}input,button{{font:inherit;padding:.5rem}}input{{width:100%;box-sizing:border-box}}
 [role=alert]{{border-left:.3rem solid #b00020;padding-left:.8rem}}</style></head><body>
 <h1>Pair with {name}</h1>
-{trouble}<p>On the node's machine, <code>foveascan pair --role view --name NAME</code> prints a code and a
-fingerprint.</p>
+{trouble}<p>This takes a code. Whoever looks after the node makes one, in its page under "Administration" or on its
+machine with <code>foveascan pair --role view --name NAME</code>, and gets a fingerprint with it.</p>
 <ol><li>Open your browser's certificate view (the sign left of the address). Its SHA-256 fingerprint must be the one
-that was <em>printed there</em>. If it is another, somebody is in between: stop. The node says<br>
+that <em>came with the code</em>. If it is another, somebody is in between: stop. The node says<br>
 <code>{fingerprint}</code></li>
 <li><form method="post" action="/v1/pair"><label>The code <input name="code" autocomplete="off" required autofocus
 autocapitalize="characters" spellcheck="false" maxlength="40" placeholder="ABCD-EFGH-IJKL-MNOP"></label>
@@ -188,8 +188,9 @@ class PairingRoutes:
 
     async def _tokens(self, request: web.Request) -> web.Response:
         access, _ = self._known()
-        used = access.last_used.of
-        return said([ListedToken(t.name, t.role, t.created_unix_s, used(t.digest)) for t in access.tokens()])
+        used, own = access.last_used.of, request[LOGIN].token
+        listed = [ListedToken(t.name, t.role, t.created_unix_s, used(t.digest), t == own) for t in access.tokens()]
+        return said(listed)
 
     async def _codes(self, request: web.Request) -> web.Response:
         access, _ = self._known()

@@ -134,13 +134,22 @@ async def test_an_admin_offers_lists_and_revokes(node: Entrance) -> None:
     async with node.ask("GET", "/v1/tokens", admin) as answer:
         listed = await answer.json()
     assert [(one["name"], one["role"]) for one in listed] == [("admin", "admin"), ("tablet", "operate")]
-    assert all(one.keys() == {"name", "role", "created", "lastUsed"} for one in listed)
+    assert all(one.keys() == {"name", "role", "created", "lastUsed", "own"} for one in listed)
+    assert [one["own"] for one in listed] == [True, False]
     assert abs(listed[1]["created"] - time.time()) < 60
     async with node.ask("POST", "/v1/codes", admin, json={"name": "tablet"}) as answer:
         assert answer.status == 409
     for status in (204, 404):
         async with node.ask("DELETE", "/v1/tokens/tablet", admin) as answer:
             assert answer.status == status
+
+
+async def test_who_revokes_himself_hears_that_it_is_done(node: Entrance) -> None:
+    admin = node.token("admin")
+    async with node.ask("DELETE", "/v1/tokens/admin", admin) as answer:
+        assert answer.status == 204
+    async with node.ask("GET", "/v1/tokens", admin) as answer:
+        assert answer.status == 401
 
 
 async def test_codes_that_wait_are_listed_without_the_code_and_can_be_ended(node: Entrance) -> None:

@@ -111,7 +111,7 @@ export class App {
     this.frame.showAfter(this.pane.pictured);
     void this.pane.pictured.then(() => this.frame.add(...[this.scans, this.scanner, this.look, this.measurePanel, this.comparePanel,
       this.display, this.pins.panel, this.worth, this.cost, this.about].map(({ element }) => element)));
-    addEventListener('hashchange', () => this.addressChanged());
+    addEventListener('hashchange', ({ newURL }) => this.addressChanged(new URL(newURL).hash));
     addEventListener('online', () => this.tell({ kind: 'retry' }));
     worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.hear(data);
     addEventListener('focus', () => void this.refreshScans());
@@ -163,7 +163,7 @@ export class App {
 
   private linked(link: LinkState): void {
     this.frame.linked(link);
-    if (link.state === 'connecting') return;
+    if (link.state === 'connecting' || link.state === 'out') return;
     if (link.state === 'ready') {
       this.node = link.node;
       this.allow(link.role !== 'view');
@@ -392,8 +392,9 @@ export class App {
     }, WRITE_MS);
   }
 
-  private addressChanged(): void {
-    this.state = parseState(location.hash.slice(1));
+  /** fragment: as it was typed; `writeState` may have written over it before we were told. */
+  private addressChanged(fragment: string): void {
+    this.state = parseState(fragment.slice(1));
     this.isAddressed = true;
     this.pane.open(this.state.scan ?? 'latest');
   }

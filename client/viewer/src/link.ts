@@ -61,7 +61,9 @@ export interface Answer {
 export type LinkState =
   | { state: 'connecting' }
   | { state: 'ready'; node: string; version: string; role: string }
-  | { state: 'lost'; reason: string; retryMs: number };
+  | { state: 'lost'; reason: string; retryMs: number }
+  /** The node knows this browser no more. */
+  | { state: 'out' };
 
 export type FromWorker =
   | { kind: 'link'; link: LinkState }

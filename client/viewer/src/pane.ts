@@ -176,15 +176,9 @@ export class Pane {
   private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {
     const framed = fresh && this.info?.id !== snapshot.info.id;
     this.info = snapshot.info;
-    try {
-      this.stage.show(snapshot, framed);
-    } catch (error) {
-      if (!(error instanceof RangeError)) throw error;
-      this.clear(); // what was there before is another scan
-      this.events.say(strings.tooLarge);
-      return;
-    }
-    if (this.stage.shrunk > 1) this.events.say(strings.shrunk(this.stage.shrunk));
+    this.stage.show(snapshot, framed);
+    const { colour, shape } = this.stage.shrunk;
+    if (colour > 1 || shape > 1) this.events.say(strings.shrunk(colour, shape));
     this.noted.dataset['scan'] = snapshot.info.id;
     this.events.opened(snapshot.info, fresh, framed);
     this.stage.paintNow();

@@ -30,8 +30,8 @@ interface Looking {
   applyMs: number;
 }
 
-/** Why there is no connection, in words for people. */
-export type Explain = () => Promise<string>;
+/** Why there is no connection, in words for people; null: the node wants a login. */
+export type Explain = () => Promise<string | null>;
 
 export class Stream {
   private socket: WebSocket | null = null;
@@ -329,6 +329,7 @@ export class Stream {
     this.socket = this.node = null;
     if (this.looking) Object.assign(this.looking, { bytes: 0, applyMs: 0 });
     const why = reason || (await this.explain());
+    if (why === null) return this.link({ state: 'out' });
     const retryMs = backoffMs(this.attempt++, Math.random());
     this.link({ state: 'lost', reason: why, retryMs });
     this.timer = setTimeout(() => this.connect(), retryMs);

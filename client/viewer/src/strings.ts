@@ -13,8 +13,10 @@ const when = (unixS: number): string => new Date(1000 * unixS).toLocaleString(un
 export const strings = {
   title: 'foveascan',
   noWebgl: 'This browser draws no WebGL 2, which the page needs. Any current Firefox, Chrome, Edge or Safari does.',
-  tooLarge: 'This graphics card cannot draw a scan of this size.',
-  shrunk: (by: number) => `Colour is shown at 1/${by} of its resolution: this graphics card takes no larger picture.`,
+  shrunk: (colour: number, shape: number) => {
+    const parts = [colour > 1 ? `colour is drawn at 1/${colour}` : '', shape > 1 ? `shape is drawn at 1/${shape}` : ''];
+    return `This graphics card takes no larger picture: ${parts.filter(Boolean).join(' and ')} of its resolution.`;
+  },
   link: {
     connecting: 'Connecting…',
     ready: (node: string) => `Connected to ${node}`,
@@ -222,12 +224,13 @@ export const strings = {
     since: (version: string, started: number) => `${version}, running since ${when(started)}`,
     logins: 'Who may come in',
     nobody: 'Nobody is paired.',
-    login: (role: string, created: number, used: number | null) =>
-      `${role} · since ${when(created)} · ${used === null ? 'last use not known' : `last used ${when(used)}`}`,
+    login: (role: string, created: number, used: number | null, own: boolean) =>
+      `${role} · since ${when(created)} · ${used === null ? 'last use not known' : `last used ${when(used)}`}${own ? ' · this browser’s own' : ''}`,
     waits: (role: string, expires: number) => `${role} · a code waits until ${when(expires)}`,
     revokeAsk: 'Revoke…',
     revokeOf: (name: string) => `Revoke ${name}`,
     sure: (name: string) => `Put ${name} out? What they are doing at this moment ends, too. To come back they have to be paired anew.`,
+    sureOfOwn: (name: string) => `${name} is this browser’s own login. Put yourself out? To come back you have to be paired anew, with a code that another admin makes, or somebody at the node’s machine.`,
     revoke: 'Revoke',
     keep: 'Leave it',
     pair: 'Let somebody in',

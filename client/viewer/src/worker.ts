@@ -98,11 +98,12 @@ function restoreCopy(model: Model): void {
 }
 
 /** A browser does not say why a WebSocket failed; the node's other end does. */
-async function explain(): Promise<string> {
+async function explain(): Promise<string | null> {
   try {
     const answer = await fetch(`${origin}/v1/stream`, { cache: 'no-store' });
     if (answer.status === 503) return ((await answer.json()) as { message: string }).message;
-    if (answer.status === 401 || answer.status === 403) return strings.link.needsToken;
+    if (answer.status === 401) return null;
+    if (answer.status === 403) return strings.link.needsToken;
     return strings.link.cut;
   } catch {
     return strings.link.unreachable;

@@ -11,7 +11,7 @@ import { locate, pick } from '../src/view/pick.ts';
 import { joined, partOf, within } from '../src/view/repaint.ts';
 import type { Part } from '../src/view/repaint.ts';
 import { pointAt } from '../src/view/room.ts';
-import { shrink } from '../src/view/shrink.ts';
+import { shrink, thin } from '../src/view/shrink.ts';
 import { STRIDES, Tiles } from '../src/view/tiles.ts';
 import type { Batch, Detail } from '../src/view/tiles.ts';
 
@@ -237,6 +237,14 @@ test('shrunk colour is the mean of what is there, wherever its rectangle begins'
   assert.equal(shrink(texels, [1, 1]), texels);
   assert.deepEqual(shrink(texels, [2, 1]), { x: 1, y: 2, width: 2, height: 2, cells: grey([10, 30, 30, 60]) });
   assert.deepEqual(shrink(texels, [2, 2]), { x: 1, y: 1, width: 2, height: 1, cells: grey([20, 40]) });
+});
+
+test('of thinned shape those samples are there that stand at multiples, wherever a rectangle begins', () => {
+  const samples = { x: 3, y: 2, width: 4, height: 3, cells: Uint16Array.of(32, 42, 52, 62, 33, 43, 53, 63, 34, 44, 54, 64) };
+  assert.deepEqual(thin(samples, 2), { x: 2, y: 1, width: 2, height: 2, cells: Uint16Array.of(42, 62, 44, 64) });
+  assert.deepEqual(thin(samples, 4), { x: 1, y: 1, width: 1, height: 1, cells: Uint16Array.of(44) });
+  assert.equal(thin({ ...samples, width: 1 }, 2).cells.length, 0);
+  assert.equal(thin({ x: 1, y: 1, width: 1, height: 1, cells: Uint16Array.of(11) }, 8).cells.length, 0);
 });
 
 test('a large change is told in parts, which are the same together', () => {

@@ -21,7 +21,7 @@ ARGUMENTS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
-WAIT_MS = 20_000
+WAIT_MS = 60_000  # at most; a machine under load takes its time
 AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
 FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
 Picture = NDArray[np.float64]

@@ -137,3 +137,21 @@ def test_it_is_for_everybody(page: Page, scheme: Literal["light", "dark"], width
     assert barriers(page) == [] == layout_faults(page)
     article = "document.querySelector('#admin article')"
     assert page.evaluate(f"{article}.scrollWidth <= {article}.clientWidth")
+
+
+def test_who_puts_himself_out_is_warned_and_then_at_the_door(browser: Browser, url: str, library: Path) -> None:
+    token = Access(access_folder(library)).grant("admin", "my tablet", time.time())
+    with blank(browser, ignore_https_errors=True) as (page, _):
+        page.set_default_timeout(PATIENCE_MS)
+        page.context.add_cookies([{"name": COOKIE, "value": token, "url": url, "secure": True}])
+        page.goto(url)
+        page.get_by_role("button", name="Administration").click()
+        row = page.locator("#admin .logins li", has_text="my tablet")
+        expect(row).to_contain_text("this browser’s own")
+        expect(page.locator("#admin .logins li", has_text=re.compile("^me"))).not_to_contain_text("own")
+        row.get_by_role("button").click()
+        expect(page.get_by_role("dialog", name="my tablet is this browser’s own login")).to_be_visible()
+        page.get_by_role("button", name="Revoke", exact=True).click()
+        page.wait_for_url("**/pair")
+        expect(page.locator("body")).to_contain_text("makes one, in its page under")
+    assert "my tablet" not in [token.name for token in Access(access_folder(library)).tokens()]

@@ -56,6 +56,7 @@ def test_a_browser_is_let_in_by_a_code_and_put_out_again(tmp_path: Path) -> None
             assert page.get_by_role("button", name="Remove pin mole").count() == 0
             assert page.get_by_text("To sweep, to set pins, to name or delete scans").first.is_visible()
             run("access", "revoke", "tablet", "--library", str(tmp_path))
+            page.wait_for_url("**/pair")
             page.goto(f"{ready['url']}/")
             assert page.url == f"{ready['url']}/pair"
         running.close()

@@ -22,6 +22,8 @@ from tests.client.viewer.browser import blank, click, crop, opened, psnr, wait_d
 from tests.client.viewer.closed_objects import CENTRE_MM, SIZE, STANDING, STEP_MM, TIPPED, bring, grid_of
 
 ABOVE = math.pi / 2 - 1e-4
+# An address is typed, and just then the page puts the view into it that it shows still.
+WRITTEN_OVER = "typed => { const was = location.href; location.assign(typed); history.replaceState(null, '', was); }"
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,8 @@ def test_an_address_typed_anew_shows_the_same_scan_from_there(browser: Browser, 
         assert psnr(crop(page, 0.5, 0.5, 300), front) < 25
         click(page, 0.5, 0.5)
         wait_updates(page, 2)
+        page.evaluate(WRITTEN_OVER, objects.seen(objects.standing, 0.5))
+        page.wait_for_url("**%2C0.5000%2C**")
 
 
 def exactly(page: Page) -> None:

@@ -23,6 +23,8 @@ export interface Login {
   role: string;
   created: number;
   lastUsed: number | null;
+  /** What this browser itself comes in by. */
+  own: boolean;
 }
 
 export interface Waiting {

@@ -21,7 +21,7 @@ export class Logins {
   private readonly question = h('p', { id: 'admin-sure' });
   private readonly role: HTMLSelectElement;
   private readonly minutes: HTMLSelectElement;
-  private leaving = '';
+  private leaving = { name: '', own: false };
   private counting: ReturnType<typeof setInterval> | undefined;
 
   constructor(private readonly words: Words, private readonly attempt: (work: () => Promise<void>) => Promise<void>) {
@@ -57,7 +57,7 @@ export class Logins {
       this.none.hidden = logins.length > 0;
       this.none.textContent = admin.nobody;
       refill(this.list,
-        ...logins.map(({ name, role, created, lastUsed }) => this.row(name, admin.login(role, created, lastUsed))),
+        ...logins.map(({ name, role, created, lastUsed, own }) => this.row(name, admin.login(role, created, lastUsed, own), own)),
         ...waiting.map(({ name, role, expires }) => this.row(name, admin.waits(role, expires))));
     } catch (error) {
       if (!(error instanceof Refused && error.status === NO_LOGINS)) throw error;
@@ -67,11 +67,11 @@ export class Logins {
     }
   }
 
-  private row(name: string, what: string): HTMLElement {
+  private row(name: string, what: string, own = false): HTMLElement {
     const { admin } = this.words;
     const ask = () => {
-      this.leaving = name;
-      this.question.textContent = admin.sure(name);
+      this.leaving = { name, own };
+      this.question.textContent = own ? admin.sureOfOwn(name) : admin.sure(name);
       this.sure.showModal();
     };
     return h('li', {}, h('span', {}, h('strong', {}, name), h('small', {}, what)),
@@ -79,8 +79,10 @@ export class Logins {
   }
 
   private async revoke(): Promise<void> {
-    await revoke(this.leaving);
-    await this.refresh();
+    const { name, own } = this.leaving;
+    await revoke(name);
+    if (own) location.replace('/pair');
+    else await this.refresh();
   }
 
   private async offer(): Promise<void> {

@@ -97,6 +97,7 @@ export class Frame {
   /** How the connection stands; while there is none, counts down to the next attempt. */
   linked(link: LinkState): void {
     clearInterval(this.retryTimer);
+    if (link.state === 'out') return location.replace('/pair'); // and no way back to what is shown here
     document.documentElement.dataset['link'] = link.state;
     this.retry.hidden = link.state !== 'lost';
     this.admin.allow(link.state === 'ready' ? link.role : null);

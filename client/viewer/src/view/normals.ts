@@ -24,14 +24,15 @@ export class Normals {
   /**
    * uniforms: of the surface; `uNormals` among them is kept up to date. level: of range, by 8 x 8 blocks.
    * spacing: between the samples held, at least: a texture as coarse as half of that shows as much, and is drawn sooner.
+   * thinned: every how many-th sample is there to be drawn.
    */
   constructor(
-    private readonly renderer: WebGLRenderer, private readonly width: number, private readonly height: number,
+    private readonly renderer: WebGLRenderer, private readonly width: number, private readonly height: number, private readonly thinned: number,
     private readonly uniforms: Uniforms, private readonly sphere: boolean, level: DataTexture, spacing: number,
   ) {
-    const stride = Math.max(1, spacing / 2);
+    const stride = Math.max(thinned, spacing / 2);
     this.pass = new Pass(NORMALS_FRAGMENT, sphere, { ...uniforms, uLevel: { value: level }, uCell: { value: new Vector2(1, 1) } });
-    this.copy = new Pass(COPY_FRAGMENT, false, { uFrom: { value: null }, uSize: uniforms['uSize']! });
+    this.copy = new Pass(COPY_FRAGMENT, false, { uFrom: { value: null }, uTo: { value: this.whole } });
     this.target = targetOf(Math.ceil(width / stride), Math.ceil(height / stride));
     uniforms['uNormals']!.value = this.target.texture;
   }
@@ -46,9 +47,14 @@ export class Normals {
     return this.copy.compile(this.renderer, this.target);
   }
 
+  /** As large as there are samples to be drawn. */
+  private get whole(): Vector2 {
+    return new Vector2(this.width, this.height).divideScalar(this.thinned).ceil();
+  }
+
   /** Whether there is a normal for every sample. */
   get isFull(): boolean {
-    return this.target.width === this.width;
+    return this.target.width === this.whole.x;
   }
 
   /** Have one for every sample from here on. */
@@ -56,7 +62,7 @@ export class Normals {
     if (this.isFull) return;
     this.drawDue();
     const coarse = this.target;
-    this.target = targetOf(this.width, this.height);
+    this.target = targetOf(this.whole.x, this.whole.y);
     this.copy.uniforms['uFrom']!.value = coarse.texture;
     this.render(this.copy, 0, 0, this.width, this.height);
     coarse.dispose();
@@ -76,7 +82,7 @@ export class Normals {
 
   /** Draw the normals of what has changed. */
   drawDue(): void {
-    if (this.due === 'all') this.render(this.pass, 0, 0, this.target.width, this.target.height);
+    if (this.due === 'all') this.render(this.pass, 0, 0, this.width, this.height);
     else for (const rectangle of this.due) this.draw(rectangle);
     this.due = [];
   }
@@ -103,12 +109,15 @@ export class Normals {
     this.copy.dispose();
   }
 
+  /** Have a pass draw where these samples are. */
   private render(pass: Pass, left: number, top: number, right: number, bottom: number): void {
     if (right <= left) return;
     const before = this.renderer.getRenderTarget();
-    (pass.uniforms['uCell']?.value as Vector2 | undefined)?.set(this.width / this.target.width, this.height / this.target.height);
+    const [across, down] = [this.width / this.target.width, this.height / this.target.height];
+    (pass.uniforms['uCell']?.value as Vector2 | undefined)?.set(across, down);
+    const [x, y] = [Math.floor(left / across), Math.floor(top / down)];
     this.target.scissorTest = true;
-    this.target.scissor.set(left, top, right - left, bottom - top);
+    this.target.scissor.set(x, y, Math.ceil(right / across) - x, Math.ceil(bottom / down) - y);
     this.renderer.setRenderTarget(this.target);
     pass.render(this.renderer);
     this.renderer.setRenderTarget(before);

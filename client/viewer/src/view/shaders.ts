@@ -12,6 +12,7 @@ precision highp float;
 precision highp int;
 precision highp usampler2D;
 uniform usampler2D uRange;
+uniform int uShift; // of the grid's rows and columns every 2^uShift-th is there
 uniform ivec2 uSize;
 uniform float uStepMm;
 uniform float uPitchMm;
@@ -31,7 +32,7 @@ ivec2 inside(int column, int row) {
 }
 
 uint stepsAt(int column, int row) {
-  return texelFetch(uRange, inside(column, row), 0).r;
+  return texelFetch(uRange, inside(column, row) >> uShift, 0).r;
 }
 `;
 
@@ -252,7 +253,7 @@ float ringAt(int row) {
 
 /* Steps of a sample, of some beside it too where columns are narrow. */
 float meanSteps(ivec2 at, int reach) {
-  float own = float(texelFetch(uRange, at, 0).r);
+  float own = float(texelFetch(uRange, at >> uShift, 0).r);
   int apart = min(int(float(reach) / ringAt(at.y)), uSize.x / 8) / (2 * TAPS);
   if (apart == 0 || own == 0.0) return own;
   float sum = 0.0, count = 0.0;
@@ -313,7 +314,8 @@ void main() {
     return;
   }
   int level = levelAt(at.x, at.y);
-  vec2 slope = slopes(at, level, max(1, int(exp2(0.5 * float(level)) + 0.5)));
+  int reach = int(exp2(0.5 * float(level)) + 0.5) >> uShift << uShift;
+  vec2 slope = slopes(at, level, max(1 << uShift, reach));
 #ifdef SPHERE
   float rowMm = HALF_TURN * here * uStepMm / float(uSize.y);
 #else
@@ -328,10 +330,10 @@ void main() {
 export const COPY_FRAGMENT = /* glsl */ `
 precision highp float;
 uniform sampler2D uFrom;
-uniform ivec2 uSize;
+uniform vec2 uTo;
 out vec4 copied;
 
 void main() {
-  copied = texture(uFrom, gl_FragCoord.xy / vec2(uSize));
+  copied = texture(uFrom, gl_FragCoord.xy / uTo);
 }
 `;

@@ -1,4 +1,4 @@
-// Colour at a whole fraction of its resolution, where a graphics card takes no larger texture.
+// Colour at a whole fraction of its resolution, and shape by some of its samples, where a graphics card takes no larger texture.
 
 export interface Texels {
   x: number;
@@ -35,4 +35,24 @@ export function shrink(texels: Texels, [across, down]: readonly [number, number]
     small[at + 3] = 255;
   }
   return { x: left, y: top, width: columns, height: rows, cells: small };
+}
+
+export interface Samples {
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+  cells: Uint16Array;
+}
+
+/** Of a rectangle the samples whose row and column are multiples of `every`, counted in these; perhaps none. */
+export function thin({ x, y, width, height, cells }: Samples, every: number): Samples {
+  const [left, top] = [Math.ceil(x / every), Math.ceil(y / every)];
+  const [columns, rows] = [Math.ceil((x + width) / every) - left, Math.ceil((y + height) / every) - top];
+  const some = new Uint16Array(columns * rows);
+  for (let row = 0, to = 0; row < rows; row++) {
+    const from = ((top + row) * every - y) * width - x;
+    for (let column = 0; column < columns; column++, to++) some[to] = cells[from + (left + column) * every]!;
+  }
+  return { x: left, y: top, width: columns, height: rows, cells: some };
 }

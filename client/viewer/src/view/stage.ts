@@ -170,9 +170,9 @@ export class Stage {
     this.draw();
   }
 
-  /** How many texels stand for one, because the graphics card takes no larger texture; 1 is all. */
-  get shrunk(): number {
-    return Math.max(...(this.surface?.shrunk ?? [1]));
+  /** How many texels, and samples along a side, stand for one, because the graphics card takes no larger texture; 1 is all. */
+  get shrunk(): { colour: number; shape: number } {
+    return { colour: Math.max(...(this.surface?.shrunk ?? [1])), shape: this.surface?.thinned ?? 1 };
   }
 
   /** Put the camera where it sees the whole scan from the front. */

@@ -19,7 +19,8 @@ import { joined, partOf } from './repaint.ts';
 import type { Part } from './repaint.ts';
 import { isSphere } from './room.ts';
 import type { Place } from './room.ts';
-import { shrink } from './shrink.ts';
+import { shrink, thin } from './shrink.ts';
+import type { Samples } from './shrink.ts';
 import { STRIDES, Tiles } from './tiles.ts';
 import type { Detail } from './tiles.ts';
 
@@ -33,6 +34,8 @@ export class Surface {
   readonly steps: Uint16Array;
   /** How many texels of the scan stand for one here, across and down, where the graphics card takes no larger texture. */
   readonly shrunk: readonly [across: number, down: number];
+  /** Every how many-th sample is drawn, where it takes no larger texture; a power of two. */
+  readonly thinned: number;
   private readonly tiles: Tiles;
   /** By stride, made when first drawn; and of a sphere, what closes it over its poles. */
   private readonly meshes: (GridMesh | undefined)[] = [];
@@ -51,29 +54,29 @@ export class Surface {
   ) {
     const { width, height } = info;
     const most = renderer.capabilities.maxTextureSize;
-    if (width > most || height > most) throw new RangeError(`this graphics card draws at most ${most} columns`);
+    this.thinned = 2 ** Math.ceil(Math.log2(Math.max(1, width / most, height / most)));
     this.shrunk = [Math.ceil(info.textureWidth / most), Math.ceil(info.textureHeight / most)];
     this.steps = snapshot.steps;
-    this.range = integers(this.steps, width, height, 'R16UI');
+    this.range = integers(this.thin({ x: 0, y: 0, width, height, cells: this.steps }));
     this.levels = [
-      integers(snapshot.levels[0], Math.ceil(width / RANGE_BLOCK), Math.ceil(height / RANGE_BLOCK), 'R8UI'),
-      integers(snapshot.levels[1], Math.ceil(info.textureWidth / TEXTURE_BLOCK), Math.ceil(info.textureHeight / TEXTURE_BLOCK), 'R8UI'),
+      integers({ cells: snapshot.levels[0], width: Math.ceil(width / RANGE_BLOCK), height: Math.ceil(height / RANGE_BLOCK) }),
+      integers({ cells: snapshot.levels[1], width: Math.ceil(info.textureWidth / TEXTURE_BLOCK), height: Math.ceil(info.textureHeight / TEXTURE_BLOCK) }),
     ];
     const [coarseWidth, coarseHeight] = [info.coarseTextureWidth, info.coarseTextureHeight];
     const coarse = isSphere(info) ? evened(snapshot.coarseTexels, coarseWidth, coarseHeight) : snapshot.coarseTexels;
     this.coarse = colours(coarse, coarseWidth, coarseHeight);
     this.dense = colours(new Uint8Array(4), 1, 1);
     this.uniforms = {
-      uRange: { value: this.range }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
+      uRange: { value: this.range }, uShift: { value: Math.log2(this.thinned) }, uSize: { value: new Vector2(width, height) }, uStepMm: { value: info.stepMm },
       uPitchMm: { value: info.pitchMm }, uZMaxMm: { value: info.zMaxMm }, uTheta0: { value: info.theta0Rad },
       uPoles: { value: new Vector2() }, uTile: { value: tileSide }, uNormals: { value: null }, uCoarse: { value: this.coarse },
       uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
       uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
     };
-    this.tiles = new Tiles(info, tileSide);
+    this.tiles = new Tiles(info, tileSide, this.thinned);
     this.closePoles();
     this.tiles.update(this.steps, snapshot.levels[0]);
-    this.normals = new Normals(renderer, width, height, this.uniforms, isSphere(info), this.levels[0], spacingOf(snapshot.levels[0]));
+    this.normals = new Normals(renderer, width, height, this.thinned, this.uniforms, isSphere(info), this.levels[0], spacingOf(snapshot.levels[0]));
   }
 
   /** Have all programs compiled; meanwhile nothing is drawn. */
@@ -92,7 +95,7 @@ export class Surface {
     this.isReady = true;
     this.normals.fill();
     // three.js asks the card about uploads once, and waits for the answer.
-    this.upload(integers(this.steps.slice(0, 1), 1, 1, 'R16UI'), this.range, 0, 0);
+    this.upload(integers({ cells: this.steps.slice(0, 1), width: 1, height: 1 }), this.range, 0, 0);
   }
 
   /** Samples from one that is held to the next, at a place. */
@@ -114,6 +117,8 @@ export class Surface {
   /** Show another picture of the same shape, as while a sweep runs. */
   replace(steps: Uint16Array, coarseTexels: Uint8Array): void {
     this.steps.set(steps);
+    const { width, height } = this.info;
+    (this.range.image.data as Uint16Array).set(this.thin({ x: 0, y: 0, width, height, cells: steps }).cells);
     (this.coarse.image.data as Uint8Array).set(coarseTexels);
     this.range.needsUpdate = this.coarse.needsUpdate = true;
     this.tiles.update(this.steps, this.levels[0].image.data as Uint8Array);
@@ -200,11 +205,17 @@ export class Surface {
       for (let row = 0; row < height; row++) {
         this.steps.set((cells as Uint16Array).subarray(row * width, (row + 1) * width), (y + row) * this.info.width + x);
       }
-      this.upload(integers(cells as Uint16Array, width, height, 'R16UI'), this.range, x, y);
+      const drawn = this.thin({ x, y, width, height, cells: cells as Uint16Array });
+      if (drawn.cells.length) this.upload(integers(drawn), this.range, drawn.x, drawn.y);
       this.normals.change({ x, y, width, height });
     }
     this.closePoles();
     this.tiles.update(this.steps, level);
+  }
+
+  /** The samples of a rectangle that are drawn, and where they lie in the texture. */
+  private thin(samples: Samples): Samples {
+    return this.thinned === 1 ? samples : thin(samples, this.thinned);
   }
 
   private patchTexels(changed: Changed[]): void {
@@ -245,12 +256,12 @@ export class Surface {
   }
 }
 
-function integers(data: Uint8Array | Uint16Array, width: number, height: number, format: 'R8UI' | 'R16UI'): DataTexture {
-  const type = format === 'R8UI' ? UnsignedByteType : UnsignedShortType;
-  const texture = new DataTexture(data as Uint16Array<ArrayBuffer>, width, height, RedIntegerFormat, type);
-  texture.internalFormat = format;
+function integers({ cells, width, height }: { cells: Uint8Array | Uint16Array; width: number; height: number }): DataTexture {
+  const isByte = cells instanceof Uint8Array;
+  const texture = new DataTexture(cells as Uint16Array<ArrayBuffer>, width, height, RedIntegerFormat, isByte ? UnsignedByteType : UnsignedShortType);
+  texture.internalFormat = isByte ? 'R8UI' : 'R16UI';
   texture.minFilter = texture.magFilter = NearestFilter;
-  texture.unpackAlignment = format === 'R8UI' ? 1 : 2;
+  texture.unpackAlignment = cells.BYTES_PER_ELEMENT;
   texture.colorSpace = NoColorSpace;
   texture.needsUpdate = true;
   return texture;

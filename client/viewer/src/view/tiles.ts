@@ -48,8 +48,8 @@ export class Tiles {
   private readonly frustum = new Frustum();
   private readonly ball = new Sphere();
 
-  /** side: of a tile [samples]; a multiple of 64. */
-  constructor(private readonly info: ScanInfo, private readonly side: number) {
+  /** side: of a tile [samples]; a multiple of 64. thinned: no finer stride is drawn. */
+  constructor(private readonly info: ScanInfo, private readonly side: number, private readonly thinned = 1) {
     this.across = Math.ceil(info.width / this.side);
     this.down = Math.ceil(info.height / this.side);
     this.stride = new Int32Array(this.across * this.down);
@@ -178,6 +178,6 @@ export class Tiles {
     for (let y = tile.row / BLOCK; y < (tile.row + rows) / BLOCK; y++) {
       for (let x = tile.column / BLOCK; x < (tile.column + columns) / BLOCK; x++) least = Math.min(least, level[y * across + x]!);
     }
-    return Math.max(1, 2 ** Math.floor(least / 2 - 1));
+    return Math.max(this.thinned, 2 ** Math.floor(least / 2 - 1));
   }
 }
