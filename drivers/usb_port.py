@@ -1,16 +1,15 @@
 """A scanner as a bare USB device, as a Port: bulk transfers by pyusb and libusb, the same frames as on serial.
 
-A thread keeps a large read pending, so that the device never waits for the node's program to come round; what arrived
-waits in memory, at most a few reads of it, then the device has to wait. Packet boundaries mean nothing: frames say
-where they end.
+Reads are pending all the time (drivers/usb_backend.py), so that the device never waits for the node's program to come
+round; where that is late, the device has to wait. Packet boundaries mean nothing: frames say where they end.
 """
 
 from __future__ import annotations
 
 import errno
 import threading
+import time
 from array import array
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,13 +20,11 @@ import usb.core
 import usb.util
 
 from drivers.address import parse_ids
+from drivers.usb_backend import ReadingAhead
 from protocol.errors import PortLost
 
 READ_BYTES = 262_144
-_WAITING_BYTES_MAX = 16 * READ_BYTES  # a tenth of a second at full speed: no longer is our thread kept waiting
-_GATHER_S = 0.008  # what follows on a piece of a sweep within this time is taken with it: fewer wake-ups
-_GATHER_FROM_BYTES = 16384  # less is an answer, which somebody waits for
-_READ_MS = 100  # how long a thread that shall end may go on waiting
+_LOOK_S = 0.1  # how long a read may go on where something else took the word that it was cancelled
 _WRITE_MS = 2000
 _STALLS_MAX = 5  # in a row
 _RULE = (
@@ -58,29 +55,26 @@ class UsbAddress:
 class UsbPort:
     """An open USB device; nobody else can use its interface meanwhile.
 
-    backend : pyusb's, another one for tests; by default libusb's.
+    backend : pyusb's with `interrupt`, another one for tests; by default drivers.usb_backend's.
     Raises PortLost when there is no such device, no permission, or somebody else uses it, naming the cure.
     """
 
     def __init__(self, address: UsbAddress, backend: Any = None) -> None:
         self._address = address
-        self._arrived: deque[bytes] = deque()
-        self._arrived_bytes = 0
-        self._awaited_bytes = 1  # the reader of the port is woken by no less
-        self._changed = threading.Condition()
-        self._is_cancelled = False
+        self._buffer = array("B", bytes(READ_BYTES))
+        self._left = b""
+        self._cancelled = threading.Event()
         self._is_closed = False
         self._lost: str | None = None
         self._detached: list[int] = []
-        self._device = _find(address, backend)
+        self._backend = backend or _libusb(address)
+        self._device = _find(address, self._backend)
         try:
             with self._translated("open"):
                 self._interface, self._source, self._sink = self._claim()
         except PortLost:
             self._let_go()
             raise
-        self._reader = threading.Thread(target=self._pump, name=f"read {address}", daemon=True)
-        self._reader.start()
 
     @property
     def name(self) -> str:
@@ -89,15 +83,16 @@ class UsbPort:
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
         """As Port.read."""
-        with self._changed:
-            if not self._arrived:
-                self._await(1, max(timeout_s, 0.0))
-                if self._arrived_bytes >= _GATHER_FROM_BYTES:
-                    self._await(READ_BYTES, _GATHER_S)
-            self._is_cancelled, was_cancelled = False, self._is_cancelled
-            if not self._arrived and not was_cancelled:
-                self._check()
-            return self._take(max_bytes) if self._arrived else b""
+        until_s = time.monotonic() + timeout_s
+        while not self._left:
+            self._check()
+            was_cancelled, left_s = self._cancelled.is_set(), until_s - time.monotonic()
+            self._left = self._receive(0.0 if was_cancelled else min(left_s, _LOOK_S))
+            if was_cancelled or left_s <= 0:
+                self._cancelled.clear()
+                break
+        data, self._left = self._left[:max_bytes], self._left[max_bytes:]
+        return data
 
     def write(self, data: bytes) -> None:
         """As Port.write; a device that takes nothing for two seconds is lost."""
@@ -115,18 +110,14 @@ class UsbPort:
 
     def cancel(self) -> None:
         """As Port.cancel."""
-        with self._changed:
-            self._is_cancelled = True
-            self._changed.notify_all()
+        self._cancelled.set()
+        self._backend.interrupt()
 
     def close(self) -> None:
         """As Port.close."""
-        with self._changed:
-            if self._is_closed:
-                return
-            self._is_closed = True
-            self._changed.notify_all()
-        self._reader.join()
+        if self._is_closed:
+            return
+        self._is_closed = True
         with suppress(*_GONE):
             usb.util.release_interface(self._device, self._interface)
         self._let_go()
@@ -139,73 +130,20 @@ class UsbPort:
         with suppress(*_GONE):
             usb.util.dispose_resources(self._device)
 
-    # -- the reading thread --------------------------------------------------------------------------------------
-
-    def _pump(self) -> None:
-        """Keep a read pending until the port is closed or the device gone."""
-        buffer, stalls = array("B", bytes(READ_BYTES)), 0
-        view = memoryview(buffer)
-        while self._lost is None and self._waits_for_room():
-            try:
-                size = self._source.read(buffer, _READ_MS)
-            except usb.core.USBTimeoutError:
-                continue
-            except usb.core.USBError as error:
-                stalls += 1
-                if error.errno != errno.EPIPE or stalls > _STALLS_MAX or not self._clear_halt():
-                    self._lose(f"read failed: {error}")
-                continue
-            stalls = 0
-            if size:
-                self._put(bytes(view[:size]))
-
-    def _clear_halt(self) -> bool:
-        """Make a stalled endpoint go on; False when the device is gone."""
-        try:
-            self._source.clear_halt()
-        except usb.core.USBError:
-            return False
-        return True
-
-    def _waits_for_room(self) -> bool:
-        """Wait while more has arrived than anybody fetched; False when the port is closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._is_closed or self._arrived_bytes < _WAITING_BYTES_MAX)
-            return not self._is_closed
-
-    def _put(self, data: bytes) -> None:
-        with self._changed:
-            self._arrived.append(data)
-            self._arrived_bytes += len(data)
-            if self._arrived_bytes >= self._awaited_bytes:
-                self._changed.notify_all()
-
-    def _lose(self, why: str) -> None:
-        with self._changed:
-            self._lost = self._lost or why
-            self._changed.notify_all()
-
-    # -- the reader of the port ----------------------------------------------------------------------------------
-
-    def _await(self, size_bytes: int, timeout_s: float) -> None:
-        """Wait until so much has arrived, or something else happens."""
-        self._awaited_bytes = size_bytes
-        self._changed.wait_for(self._has_news, timeout_s)
-
-    def _has_news(self) -> bool:
-        has_enough = self._arrived_bytes >= self._awaited_bytes
-        return bool(has_enough or self._is_cancelled or self._lost or self._is_closed)
-
-    def _take(self, max_bytes: int) -> bytes:
-        was_full = self._arrived_bytes >= _WAITING_BYTES_MAX
-        data = self._arrived.popleft()
-        if len(data) > max_bytes:
-            self._arrived.appendleft(data[max_bytes:])
-            data = data[:max_bytes]
-        self._arrived_bytes -= len(data)
-        if was_full:
-            self._changed.notify_all()
-        return data
+    def _receive(self, timeout_s: float) -> bytes:
+        """What has come, or comes in time; a stalled endpoint is cleared, so often. Raises PortLost."""
+        stalls, timeout_ms = 0, max(1, round(1000 * timeout_s))  # 0 would be for ever
+        with self._translated("read"):
+            while True:
+                try:
+                    return bytes(memoryview(self._buffer)[: self._source.read(self._buffer, timeout_ms)])
+                except usb.core.USBTimeoutError:
+                    return b""
+                except usb.core.USBError as error:
+                    stalls += 1
+                    if error.errno != errno.EPIPE or stalls > _STALLS_MAX:
+                        raise
+                    self._source.clear_halt()
 
     def _check(self) -> None:
         if self._is_closed or self._lost:
@@ -217,7 +155,7 @@ class UsbPort:
         try:
             yield
         except _GONE as error:
-            self._lose(f"{doing} failed: {_in_words(error, self._address)}")
+            self._lost = self._lost or f"{doing} failed: {_in_words(error, self._address)}"
             raise PortLost(f"{self._address}: {self._lost}") from error
 
     def _claim(self) -> tuple[int, Any, Any]:
@@ -248,11 +186,16 @@ class UsbPort:
                 self._detached = [number for number in driven if not self._device.is_kernel_driver_active(number)]
 
 
-def _find(address: UsbAddress, backend: Any) -> Any:
-    """The device at an address. Raises PortLost."""
-    backend = backend or usb.backend.libusb1.get_backend()
+def _libusb(address: UsbAddress) -> ReadingAhead:
+    """The machine's. Raises PortLost."""
+    backend = usb.backend.libusb1.get_backend()
     if backend is None:
         raise PortLost(f"{address}: no USB here: libusb is not installed (libusb-1.0-0), or the machine has no bus")
+    return ReadingAhead(backend)
+
+
+def _find(address: UsbAddress, backend: Any) -> Any:
+    """The device at an address. Raises PortLost."""
     try:
         found = list(usb.core.find(True, backend=backend, idVendor=address.vendor, idProduct=address.product))
         chosen = [device for device in found if _has_serial(device, address.serial_number)]

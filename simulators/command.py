@@ -7,6 +7,7 @@ import json
 import math
 import shlex
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -155,11 +156,12 @@ def _port(args: argparse.Namespace) -> Iterator[tuple[ServedPort, dict[str, Any]
     from simulators.tty_gadget import TtyGadget
     from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
     from simulators.usb_gadget import UsbGadget
-    from simulators.usb_testbed import UsbTestbed
+    from simulators.usb_testbed import BUS_SWITCH_S, UsbTestbed
 
     rate_bytes_s = args.link_rate or (args.baud or 0) / BITS_PER_BYTE
     if args.link == "usb":
         identity = UsbIdentity(serial_number=args.serial_number)
+        sys.setswitchinterval(BUS_SWITCH_S)
         with closing(UsbTestbed(args.path, identity, rate_bytes_s or USB_BYTES_S)) as bed:
             yield bed, {"path": identity.address, "environment": bed.environment}
     elif args.link == "gadget":

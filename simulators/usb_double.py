@@ -36,7 +36,7 @@ class UsbDouble(usb.backend.IBackend):  # type: ignore[misc]
         self._changed = threading.Condition()
         self._to_node: deque[bytes] = deque()
         self._to_device: deque[bytes] = deque()
-        self._is_cancelled = False
+        self._is_cancelled = self._is_interrupted = False
 
     # -- the device's end ----------------------------------------------------------------------------------------
 
@@ -74,7 +74,13 @@ class UsbDouble(usb.backend.IBackend):  # type: ignore[misc]
         with self._changed:
             self.is_plugged = True
 
-    # -- pyusb's end ---------------------------------------------------------------------------------------------
+    # -- the node's end: pyusb's, and `interrupt` --------------------------------------------------------------------
+
+    def interrupt(self) -> None:
+        """End the read that waits, or else the next one."""
+        with self._changed:
+            self._is_interrupted = True
+            self._changed.notify_all()
 
     def enumerate_devices(self) -> Any:
         """The one device."""
@@ -185,7 +191,10 @@ class UsbDouble(usb.backend.IBackend):  # type: ignore[misc]
         self._check_halt()
         until_s = time.monotonic() + timeout / 1000
         with self._changed:
-            self._changed.wait_for(lambda: self._to_node or not self.is_plugged, until_s - time.monotonic())
+            self._changed.wait_for(
+                lambda: self._to_node or not self.is_plugged or self._is_interrupted, until_s - time.monotonic()
+            )
+            self._is_interrupted = False
             self._check_plugged()
             if not self._to_node:
                 raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)

@@ -28,6 +28,7 @@ from simulators.usb_descriptors import BULK_IN, BULK_OUT, UsbIdentity
 from simulators.usb_uevent import announce
 
 PRELOAD = "libumockdev-preload.so.0"
+BUS_SWITCH_S = 0.00005  # for sys.setswitchinterval: the bus waits for the table's arithmetic no longer
 _HOLD_S = 0.002  # how long a reap waits for news: longer holds up writes, shorter spins
 _OUT_WAITING_BYTES = 1 << 20
 _MESSAGE = struct.Struct("<QQQ")
@@ -282,7 +283,9 @@ class UsbTestbed:
         elif request == _RELEASE:
             plugged.claimed_by = None
         elif request == _CLEAR_HALT:
-            plugged.is_halted = False
+            with self._changed:
+                plugged.is_halted = False
+                self._fill()
 
     def _reap(self, client: _Client, plugged: _Plugged, address: int) -> None:
         """Hand over a finished transfer, or say that there is none yet."""
@@ -307,12 +310,12 @@ class UsbTestbed:
             if kind == _TYPE_CONTROL:
                 self._control(urb, sent)
                 plugged.done.append(urb)
-            elif self._refuses(plugged):
-                urb.status = -errno.EPIPE
-                plugged.done.append(urb)
             elif endpoint == BULK_OUT:
-                self._in.append(sent)
-                urb.actual = size
+                if self._refuses(plugged):
+                    urb.status = -errno.EPIPE
+                else:
+                    self._in.append(sent)
+                    urb.actual = size
                 plugged.done.append(urb)
             elif endpoint == BULK_IN:
                 plugged.pending.append(urb)
@@ -341,9 +344,16 @@ class UsbTestbed:
         return plugged.is_halted
 
     def _fill(self) -> None:
-        """Complete pending reads with what waits: each with the rest of one write, or as much as it has room for."""
+        """Complete pending reads with what waits: each with the rest of one write, or as much as it has room for.
+
+        The first one finds the endpoint halted if it halts now, and those behind it wait until that is cleared.
+        """
         plugged = self._plugged
-        while plugged.pending and self._out:
+        if plugged.pending and self._out and not plugged.is_halted and self._refuses(plugged):
+            urb = plugged.pending.popleft()
+            urb.status = -errno.EPIPE
+            plugged.done.append(urb)
+        while plugged.pending and self._out and not plugged.is_halted:
             urb, data = plugged.pending.popleft(), self._out.popleft()
             urb.data = data[: urb.size]
             urb.actual = len(urb.data)
@@ -392,8 +402,9 @@ class _Client:
         for address, data in writes or []:
             parts += (_MESSAGE.pack(_WRITE, address, len(data)), data)
         parts.append(_MESSAGE.pack(_DONE, result, 0))
-        for part in parts if sum(map(len, parts)) > 1 << 16 else [b"".join(parts)]:
-            self._connection.sendall(part)
+        sent = self._connection.sendmsg(parts)  # at once: between two calls our thread would wait for the table's
+        if sent < sum(map(len, parts)):  # interrupted
+            self._connection.sendall(b"".join(parts)[sent:])
 
     def fail(self, number: int) -> None:
         """The ioctl failed."""

@@ -1,6 +1,7 @@
 """What `bench capture` runs in processes of their own, so that each one's time and memory can be told from the others'.
 
-    device LINK PATH SIZE BYTES_S TURN_S    a simulated scanner; prints a line for each sweep: seconds, columns' bytes,
+    device LINK PATH SIZE BYTES_S TURN_S PORTION
+                                            a simulated scanner; prints a line for each sweep: seconds, columns' bytes,
                                             processor time, how long the node kept it waiting
     look URL CLIENTS                        clients that look as fast as they can, until SIGTERM; prints their updates
     read ADDRESS BYTES                      the USB driver alone, under umockdev's preload; prints seconds and CPU
@@ -11,7 +12,6 @@
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import json
 import os
 import random
@@ -26,8 +26,6 @@ from typing import Any
 
 import numpy as np
 
-PR_SET_TIMERSLACK = 29
-SWITCH_S = 0.0005  # the emulated bus waits for the table's arithmetic no longer
 NICE = 19  # clients stand for other machines: they may have what is left of this one
 
 
@@ -36,16 +34,16 @@ def say(**record: Any) -> None:
     print(json.dumps(record), flush=True)
 
 
-def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str) -> None:
-    """A scanner that says how long each of its sweeps took."""
+def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str, portion: str) -> None:
+    """A scanner that says how long each of its sweeps took. portion : bytes that it sends at once."""
     from protocol.framing import SERIAL_PAYLOAD_MAX, USB_PAYLOAD_MAX
     from protocol.scanner_messages import State
-    from simulators.carriers import PORTION_BYTES, PtyPort, serve
-    from simulators.command import BITS_PER_BYTE, USB_PORTION_BYTES
+    from simulators.carriers import PtyPort, serve
+    from simulators.command import BITS_PER_BYTE
     from simulators.scanner import SimulatedScanner
     from simulators.specimen import make_specimen
     from simulators.turntable import Turntable
-    from simulators.usb_testbed import UsbTestbed
+    from simulators.usb_testbed import BUS_SWITCH_S, UsbTestbed
 
     class Timed(SimulatedScanner):
         _began: tuple[float, float, int, float] | None = None
@@ -69,7 +67,7 @@ def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str) -> N
             self._stands_since_s = now_s if self._is_starved() else None
             return data
 
-    sys.setswitchinterval(SWITCH_S)
+    sys.setswitchinterval(BUS_SWITCH_S)
     is_usb = link == "usb"
     table = Turntable(make_specimen("head", size), turn_s=float(turn_s))
     scanner = Timed(table, payload_max=USB_PAYLOAD_MAX if is_usb else SERIAL_PAYLOAD_MAX)
@@ -88,7 +86,7 @@ def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str) -> N
     with closing(port):
         environment = port.environment if isinstance(port, UsbTestbed) else {}
         say(address=port.name, environment=environment)
-        serve(scanner, port, stop, USB_PORTION_BYTES if is_usb else PORTION_BYTES)
+        serve(scanner, port, stop, int(portion))
 
 
 def look(url: str, clients: str) -> None:
@@ -134,13 +132,9 @@ async def _look(url: str, clients: int) -> int:
 
 
 def read(address: str, size_bytes: str) -> None:
-    """Everything that a device sends, thrown away.
-
-    At every ioctl the preload sleeps for 0 s, which the kernel takes for its timer's slack, 50 us; no real USB does.
-    """
+    """Everything that a device sends, thrown away."""
     from drivers.usb_port import UsbAddress, UsbPort
 
-    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1)
     with closing(UsbPort(UsbAddress.parse(address))) as port:
         port.write(b"go")
         left, began_s, cpu_s = int(size_bytes), 0.0, 0.0

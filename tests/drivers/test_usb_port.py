@@ -112,13 +112,13 @@ def test_cancel_ends_a_pending_read(port: UsbPort) -> None:
     assert port.read(100, 60) == b""
 
 
-def test_close_ends_a_pending_read_and_may_be_repeated(port: UsbPort) -> None:
-    timer = threading.Timer(0.05, port.close)
-    timer.start()
-    with pytest.raises(PortLost, match="closed"):
-        port.read(100, 60)
-    timer.join()
-    port.close()
+def test_close_ends_every_use_and_may_be_repeated(port: UsbPort) -> None:
+    for _ in range(2):
+        port.close()
+        with pytest.raises(PortLost, match="closed"):
+            port.read(100, 60)
+        with pytest.raises(PortLost, match="closed"):
+            port.write(b"x")
 
 
 def test_a_device_without_permission_names_the_udev_rule(double: UsbDouble) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import usb.core
 
+from drivers.usb_backend import PENDING
 from drivers.usb_port import READ_BYTES, UsbAddress, UsbPort
 from protocol.errors import PortLost
 from simulators.pace import CATCH_UP_S
@@ -89,6 +90,65 @@ def test_a_stalled_endpoint_is_cleared_and_goes_on(bed: Bed, port: UsbPort) -> N
         bed.write(word)
         assert read_all(port, 1) == word
     assert bed.stalls == 0
+
+
+def test_what_comes_before_a_halt_is_not_lost_and_what_comes_after_follows_it(bed: Bed, port: UsbPort) -> None:
+    words = [os.urandom(1 + 700 * size) for size in range(12)]
+    assert port.read(1, 0) == b""  # reads are pending now, and nobody takes what they bring
+    for number, word in enumerate(words):
+        bed.stalls += number in (3, 4, 9)
+        bed.write(word)
+    assert read_all(port, sum(map(len, words))) == b"".join(words)
+    assert bed.stalls == 0
+
+
+def test_many_small_transfers_are_taken_at_once(bed: Bed, port: UsbPort) -> None:
+    words = [os.urandom(100) for _ in range(PENDING)]
+    assert port.read(1, 0) == b""
+    for word in words:
+        bed.write(word)
+    got, reads = b"", 0
+    while len(got) < 100 * PENDING:
+        got, reads = got + port.read(1 << 20, 5), reads + 1
+    assert got == b"".join(words) and reads < PENDING
+
+
+def test_what_nobody_reads_has_to_wait_and_is_not_lost(bed: Bed, port: UsbPort) -> None:
+    data, sent = os.urandom(READ_BYTES), threading.Semaphore(0)
+
+    def flood() -> None:
+        for _ in range(3 * PENDING):
+            bed.write(data)
+            sent.release()
+
+    assert port.read(1, 0) == b""
+    thread = threading.Thread(target=flood, daemon=True)
+    thread.start()
+    for _ in range(PENDING):  # so many find a place
+        assert sent.acquire(timeout=SOON_S)
+    for _ in range(3 * PENDING):
+        assert read_all(port, READ_BYTES) == data
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+
+
+def test_a_port_is_closed_while_reads_are_pending_and_opened_again(bed: Bed) -> None:
+    for word in (b"1", b"2"):
+        with closing(UsbPort(ADDRESS)) as port:
+            assert port.read(1, 0) == b""
+            bed.write(word)
+            assert read_all(port, 1) == word
+
+
+def test_cancel_ends_a_pending_read(bed: Bed, port: UsbPort) -> None:
+    threading.Timer(0.1, port.cancel).start()
+    began_s = time.monotonic()
+    assert port.read(100, 30) == b""
+    assert time.monotonic() - began_s < 10
+    port.cancel()
+    assert port.read(100, 30) == b""
+    bed.write(b"and then")
+    assert read_all(port, 8) == b"and then"
 
 
 def test_a_paced_device_is_no_faster_than_its_rate() -> None:
