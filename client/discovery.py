@@ -47,7 +47,7 @@ def located(node: NodeAddress | str) -> tuple[str, URL]:
         parts = URL(url)
         if parts.scheme in ("http", "https") and parts.host:
             return url, parts
-    except ValueError:
+    except (ValueError, IndexError):  # IndexError: aio-libs/yarl#1822
         pass
     raise NodeLost(f"{url!r} is no address of a node; use https://HOST:PORT")
 

@@ -180,5 +180,5 @@ def _is_loopback_name(host: str) -> bool:
     """Whether a Host header names this machine itself: else a page whose name leads here would be let in."""
     try:
         return is_loopback(URL(f"http://{host}").host or "")
-    except ValueError:
+    except (ValueError, IndexError):  # IndexError: aio-libs/yarl#1822
         return False

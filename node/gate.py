@@ -68,6 +68,13 @@ class Line(web.RequestHandler):
         super().connection_lost(exc)
         self._gate.leave(self)
 
+    def data_received(self, data: bytes) -> None:  # noqa: D102  # as asyncio has it
+        try:
+            super().data_received(data)
+        except IndexError:  # of a target that is no URL (aio-libs/yarl#1822)
+            log.warning("what came is no request: its target is no URL")
+            self.force_close()
+
     def handle_error(
         self, request: web.BaseRequest, status: int = 500, exc: BaseException | None = None, message: str | None = None
     ) -> web.StreamResponse:

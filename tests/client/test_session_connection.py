@@ -170,7 +170,9 @@ async def test_nobody_listening_is_one_error_with_its_cure() -> None:
             pass
 
 
-@pytest.mark.parametrize("url", ["", "nonsense", "ftp://127.0.0.1:9", "http://", "http://127.0.0.1:99999"])
+@pytest.mark.parametrize(
+    "url", ["", "nonsense", "ftp://127.0.0.1:9", "http://", "http://127.0.0.1:99999", "http://[::1]@"]
+)
 async def test_what_is_no_url_is_named(url: str) -> None:
     with pytest.raises(NodeLost, match="https://HOST:PORT"):
         async with connect(url):

@@ -158,7 +158,10 @@ async def test_a_cookie_changes_nothing_without_an_origin(node: Entrance) -> Non
         assert answer.status == 204
 
 
-@pytest.mark.parametrize(("host", "status"), [("localhost:1", 200), ("[::1]:1", 200), ("evil.example", 403), ("", 403)])
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [("localhost:1", 200), ("[::1]:1", 200), ("evil.example", 403), ("", 403), ("[::1]@", 403), ("[::1]:x", 403)],
+)
 async def test_without_login_a_name_that_leads_here_is_not_enough(host: str, status: int) -> None:
     app = web.Application(middlewares=[Auth(None).admit])
 

@@ -244,6 +244,19 @@ async def test_who_does_not_read_the_answer_is_cut_off(tmp_path: Path) -> None:
             assert answer.status == 200
 
 
+async def test_a_target_that_is_no_url_ends_the_connection_and_no_more(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with entrance(tmp_path / "library") as node:
+        async with line_to(node) as (reader, writer):
+            writer.write(b"GET http://[::1]@/ HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert await reader.read() == b""
+        async with node.ask("GET", "/healthz") as answer:
+            assert answer.status == 200
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+    assert "its target is no URL" in caplog.text
+
+
 async def test_what_is_no_http_is_told_so_and_nothing_of_us(tmp_path: Path) -> None:
     async with entrance(tmp_path / "library") as node, line_to(node) as (reader, writer):
         writer.write(b"GET /v1/scans HTTP/1.1\r\nHost: x\r\nA\x00B: y\r\n\r\n")
