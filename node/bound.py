@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -44,6 +45,7 @@ class Bound:
         quick: bool,
         range_model: RangeModel | None = None,
         hurried: bool = False,
+        pool: Executor | None = None,
     ) -> Update | ClassicUpdate:
         """The update that answers a look; arguments as for plan_update. codecs : what the client takes, best first.
 
@@ -58,7 +60,7 @@ class Bound:
         codec = choose_codec(("jpeg", *codecs) if spares_time else codecs, self.scan, look, model)
         plan = partial(
             plan_update, self.scan, self.state, look, budget_bytes=budget_bytes, superseded=superseded, model=model,
-            quick=quick, range_model=range_model, hurried=hurried,
+            quick=quick, range_model=range_model, hurried=hurried, pool=pool,
         )  # fmt: skip
         update = plan(codec)
         if codec == "htj2k" or "htj2k" not in codecs or not _falls_short(update, look):

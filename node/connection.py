@@ -344,7 +344,12 @@ class Connection:
         quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
         if hurried:
             self._metrics.hurried()
-        job = partial(bound.plan, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried)
+        pool = None if hurried else self._exhibits.idle_pool()
+
+        def job() -> Update | ClassicUpdate:
+            update = bound.plan(look, self._codecs, budget, superseded, models[0], quick, models[1], hurried, pool)
+            return update.settled() if pool is None and isinstance(update, Update) else update
+
         return await self._exhibits.work(job, "look")
 
     async def _send_update(self, bound: Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float) -> None:

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from typing import Literal, TypeVar, overload
@@ -141,6 +141,10 @@ class Exhibits:
             self._working -= 1
             self._moved_s = time.monotonic()
             self._encoded(of, begun_s - asked_s, self._moved_s - begun_s)
+
+    def idle_pool(self) -> Executor | None:
+        """The encoding threads, for a job that can use two of them; None while a fast sweep takes what there is."""
+        return None if self._way.is_taken else self._pool
 
     @property
     def queued(self) -> int:

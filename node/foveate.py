@@ -10,25 +10,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import msgspec
 import numpy as np
 
+from node.beside import both
 from node.coded import Coded, framed
 from node.library import Scan
 from node.quality import Encodes, Superseded
 from node.range_model import RangeModel
 from node.range_search import RangeSearch
-from node.refine_range import code_range, note_range, settle_range
-from node.refine_texture import code_texture, db_of_mse, mse_of_db, note_texture, select_texture
+from node.refine_range import code_range, settle_range
+from node.refine_texture import code_texture, db_of_mse, mse_of_db, select_texture, settle_texture
 from node.state import ClientState
 from node.texture_model import TextureModel
 from node.texture_search import TextureSearch
 from protocol.grid import RANGE_BLOCK
 from protocol.lattice import Channel
-from protocol.messages import CodecName, Look, RangeParameters, TextureParameters, Updated, encode_message
+from protocol.messages import (
+    CodecName,
+    Look,
+    LookParameters,
+    RangeParameters,
+    TextureParameters,
+    Updated,
+    encode_message,
+)
 from protocol.region import Region
 from protocol.sphere import region_on
 from protocol.strips import samples_of
@@ -51,7 +61,7 @@ class Update:
 
     coded : its refinements, in order.    state : the client's state once they have arrived.
     error_max_mm, texture_db : what is left in the window; None where this update did not measure it, or not yet.
-    settle : computes what may wait (digest, errors); None when nothing does.
+    settle : computes what may wait until the bytes are sent (digest, errors); None when nothing does.
     """
 
     coded: tuple[Coded, ...]
@@ -85,6 +95,7 @@ def plan_update(
     quick: bool = False,
     range_model: RangeModel | None = None,
     hurried: bool = False,
+    pool: Executor | None = None,
 ) -> Update:
     """Plan the update that answers a look.
 
@@ -92,10 +103,11 @@ def plan_update(
     superseded : asked between encodes; when true, what is planned so far is dropped.
     model : what the scan's texture takes, where that is known by now.   quick : spare time rather than bytes.
     range_model : what its range misses, likewise.   hurried : others wait, so spare what a few percent of bytes buy.
+    pool : a free thread of it plans range meanwhile, where that does not depend on what texture takes.
     Raises LatticeError or CodecError where explicit parameters do not fit the scan.
     """
     planner = _Planner(
-        scan, state.copy(), look, codec, budget_bytes, superseded, model, quick, range_model, hurried
+        scan, state.copy(), look, codec, budget_bytes, superseded, model, quick, range_model, hurried, pool
     )
     try:
         planner.run()
@@ -119,19 +131,22 @@ class _Planner:
         quick: bool,
         range_model: RangeModel | None,
         hurried: bool,
+        pool: Executor | None,
     ) -> None:
         self._scan, self._state, self._look, self._codec, self._quick = scan, state, look, codec, quick
+        self._pool = pool
         self._left = math.inf if budget_bytes is None else float(budget_bytes - REPLY_BYTES)
         self._spare = 0.0 if budget_bytes is None else (1 - FILL) * budget_bytes
-        self._encodes = Encodes(superseded)
+        self._encodes = {channel: Encodes(superseded) for channel in Channel}  # each counted by one thread
         self._coded: list[Coded] = []
-        self._unsettled: list[Coded] = []
         self._limited = False
         self._window = look.window if look.scale is None else look.scale**2
         self._range_region, self._texture_region = self._regions(self._window)
-        self._range = RangeSearch(scan, state, look, self._range_region, range_model, hurried, self._encodes)
+        self._range = RangeSearch(
+            scan, state, look, self._range_region, range_model, hurried, self._encodes[Channel.RANGE]
+        )
         self._texture = TextureSearch(
-            scan, state, look, self._texture_region, codec, model, quick, hurried, self._encodes
+            scan, state, look, self._texture_region, codec, model, quick, hurried, self._encodes[Channel.TEXTURE]
         )
 
     def _regions(self, window: float) -> tuple[Region, Region]:
@@ -144,13 +159,30 @@ class _Planner:
 
     def run(self) -> None:
         """Choose, encode and note the refinements."""
-        explicit = self._look.parameters
-        if explicit is not None:
-            if explicit.range:
-                self._take(self._code_range(explicit.range, self._range_region, quick=True), settle=False)
-            if explicit.texture:
-                self._take(self._code_texture(explicit.texture, self._texture_region, merged=False))
-            return
+        if self._look.parameters is not None:
+            self._run_explicit(self._look.parameters)
+        elif math.isinf(self._left):
+            of_range, texture = both(self._pool, self._reach_range, lambda: self._texture.search(math.inf, math.inf))
+            self._limited = self._texture.limited
+            for coded in (*of_range, texture):
+                self._take(coded)
+        else:
+            self._run_within()
+
+    def _run_explicit(self, wanted: LookParameters) -> None:
+        """Encode as the look says."""
+        for coded in both(
+            self._pool,
+            lambda: self._code_range(wanted.range, self._range_region, quick=True),
+            lambda: self._code_texture(wanted.texture, self._texture_region, merged=False),
+        ):
+            self._take(coded)
+
+    def _reach_range(self) -> list[Coded]:
+        return self._range.reach(self._range.choose(self._range.target_steps))
+
+    def _run_within(self) -> None:
+        """Choose, encode and note what fits the budget; in turn, since each takes what the other leaves."""
         wanted, range_bytes = self._divide()
         aim, limit = self._left - range_bytes - self._spare / 2, self._left - RANGE_LEAST * range_bytes
         texture = self._texture.search(aim, limit)
@@ -160,34 +192,34 @@ class _Planner:
         for coded in self._fill_range(wanted, self._left - (texture.wire_bytes if texture else 0)):
             self._take(coded)
         self._take(texture)
-        if self._look.fill and not self._limited and math.isfinite(self._left):
+        if self._look.fill and not self._limited:
             self._fill_periphery(wanted)
 
     def update(self) -> Update:
         """What came of it."""
         reason: Reason = "byte limit" if self._limited else "complete"
         texture_db = None if self._texture.mse is None else db_of_mse(self._texture.mse)
-        update = Update(
-            tuple(self._coded), self._state, reason, None, texture_db, self._encodes.count, self._settle
-        )
-        return update if self._unsettled else update.settled()
+        encodes = sum(each.count for each in self._encodes.values())
+        update = Update(tuple(self._coded), self._state, reason, None, texture_db, encodes, self._settle)
+        return update if self._coded else update.settled()
 
     def _settle(self) -> float:
-        """Note what was left for later. Returns the largest range error left in the window. [mm]"""
-        while self._unsettled:
-            settle_range(self._scan, self._state, self._unsettled.pop(), self._range.target_steps)
+        """Note the errors that were left, and the digest. Returns the largest error of range in the window. [mm]"""
+        for coded in self._coded:
+            if coded.channel is Channel.RANGE:
+                settle_range(self._scan, self._state, coded, self._range.target_steps)
+            else:
+                settle_texture(self._scan, self._state, coded)
         return _error_in(self._state, self._range_region) * self._scan.spec.step_mm
 
     def _divide(self) -> tuple[RangeParameters, float]:
-        """The range parameters to use and the bytes to keep for them; none are kept where there is no limit.
+        """The range parameters to use and the bytes to keep for them.
 
-        Without a limit, or where both qualities fit it: the cheapest that reach the quality. Else the pair that falls
-        short the least, a doubled range error counting as much as 6 dB of texture.
+        Where both qualities fit the limit: the cheapest that reach the quality. Else the pair that falls short the
+        least, a doubled range error counting as much as 6 dB of texture.
         """
         target_steps = self._range.target_steps
         wanted = self._range.choose(target_steps)
-        if math.isinf(self._left):
-            return wanted, 0.0
         range_bytes = self._range.expected_bytes(wanted)
         best, least = (wanted, range_bytes), self._shortfall(0, range_bytes)
         doubled = 0
@@ -210,7 +242,7 @@ class _Planner:
 
     def _fill_range(self, wanted: RangeParameters, limit_bytes: float) -> list[Coded]:
         """Range as wanted; where bytes are short, the best that they allow."""
-        if not self._limited or math.isinf(limit_bytes):
+        if not self._limited:
             found = self._range.reach(wanted)
             if sum(coded.wire_bytes for coded in found) <= limit_bytes:
                 return found
@@ -263,29 +295,27 @@ class _Planner:
 
     # -- one refinement --------------------------------------------------------------------------------------------
 
-    def _code_range(self, wanted: RangeParameters, region: Region, *, quick: bool = False) -> Coded | None:
-        self._encodes.add()
+    def _code_range(self, wanted: RangeParameters | None, region: Region, *, quick: bool = False) -> Coded | None:
+        if wanted is None:
+            return None
+        self._encodes[Channel.RANGE].add()
         return code_range(self._scan, self._state, region, wanted, quick=quick)
 
-    def _code_texture(self, wanted: TextureParameters, region: Region, *, merged: bool = True) -> Coded | None:
-        self._encodes.add()
+    def _code_texture(self, wanted: TextureParameters | None, region: Region, *, merged: bool = True) -> Coded | None:
+        if wanted is None:
+            return None
+        self._encodes[Channel.TEXTURE].add()
         return code_texture(self._scan, self._state, region, wanted, quick=self._quick, merged=merged)
 
-    def _take(self, coded: Coded | None, *, settle: bool = True) -> None:
-        """Add a refinement to the update, if it fits what is left; note its errors at once or later."""
+    def _take(self, coded: Coded | None) -> None:
+        """Add a refinement to the update, if it fits what is left."""
         if coded is None:
             return
         if coded.wire_bytes > self._left:
             self._limited = True
             return
         self._left -= coded.wire_bytes
-        if coded.channel is Channel.RANGE and not settle:
-            coded.note(self._state)
-            self._unsettled.append(coded)
-        elif coded.channel is Channel.RANGE:
-            note_range(self._scan, self._state, coded, self._range.target_steps)
-        else:
-            note_texture(self._scan, self._state, coded)
+        coded.note(self._state)
         self._coded.append(coded)
 
 

@@ -119,9 +119,8 @@ def texture_lattice(
     return region_lattice(region, Channel.TEXTURE, round(2 * wanted.p), rho_of(wanted.s), strides)
 
 
-def note_texture(scan: Scan, state: ClientState, coded: Coded) -> None:
-    """Record a texture refinement in a client's state: holdings, and the error left in its blocks where measured."""
-    coded.note(state)
+def settle_texture(scan: Scan, state: ClientState, coded: Coded) -> None:
+    """Record in a client's state the error that a texture refinement leaves in its blocks, where that was measured."""
     for part in coded.parts:
         rows, columns = np.nonzero(part.selection.adopted)
         blocks = part.selection.y.block[rows], part.selection.x.block[columns]

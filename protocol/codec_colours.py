@@ -28,7 +28,8 @@ _UNIT = 127  # of a quaternion's numbers
 _SCALE = codec_htj2k.LEVEL / math.sqrt(3)  # of turned colours: with it the first axis of a grey image is its mean
 _MIDDLE = 1 << 15
 _GREY = 128
-_EVERY = 2  # of an image's rows, with the one below: as many tell its axes
+_EVERY = 2  # of an image's rows, with the one below: as many tell its axes, of a large one ...
+_TEXELS = 1 << 16  # ... so many texels
 # Colours of Y Cb Cr, and back (ISO/IEC 15444-1 G.3).
 _FROM_YCC = np.array([[1, 0, 1.402], [1, -0.114 * 1.772 / 0.587, -0.299 * 1.402 / 0.587], [1, 1.772, 0]])
 _TO_YCC: FloatArray = np.linalg.inv(_FROM_YCC)
@@ -40,11 +41,10 @@ def encode(image: ImageArray, quality: float) -> bytes:
     quality : 0..LOSSY_MAX in sixteenths, step 2**(-quality/8). Raises CodecError for any other.
     """
     whole, sixteenths = divmod(round(quality * SIXTEENTHS), SIXTEENTHS)
-    values = image.astype(np.float32)
     turn = _turn_of(image)
     matrix = _SCALE * _FROM_YCC @ _axes(turn)
-    offset = _MIDDLE + 0.5 - matrix @ np.full(3, _GREY)
-    turned = cv2.transform(values, np.column_stack([matrix, offset])).astype(np.uint16)
+    offset = _MIDDLE - matrix @ np.full(3, _GREY)
+    turned = cv2.transform(image.astype(np.uint16), np.column_stack([matrix, offset]))
     return _PREFIX.pack(sixteenths, *turn) + codec_htj2k.encode(turned, whole + sixteenths / SIXTEENTHS)
 
 
@@ -52,11 +52,11 @@ def decode(payload: bytes, shape: tuple[int, int], quality: int) -> ImageArray:
     """(h, w, 3) uint8 RGB of a payload, shape = (h, w), quality its whole steps. Raises CodecError."""
     sixteenths, turn = _read_prefix(payload)
     exact = quality + sixteenths / SIXTEENTHS
-    turned = codec_htj2k.decode(payload[_PREFIX.size :], (*shape, 3), exact).astype(np.float32)
+    turned = codec_htj2k.decode(payload[_PREFIX.size :], (*shape, 3), exact)
     matrix = _axes(turn).T @ _TO_YCC / _SCALE
-    offset = _GREY + 0.5 - matrix @ np.full(3, _MIDDLE)
+    offset = _GREY - matrix @ np.full(3, _MIDDLE)
     values = cv2.transform(turned, np.column_stack([matrix, offset]))
-    return np.clip(values, 0, 255, out=values).astype(np.uint8)
+    return np.asarray(cv2.convertScaleAbs(values).reshape(values.shape), np.uint8)
 
 
 def restore(payload: bytes, shape: tuple[int, int], quality: int) -> bytes:
@@ -76,7 +76,8 @@ def _read_prefix(payload: bytes) -> tuple[int, tuple[int, ...]]:
 
 def _turn_of(image: ImageArray) -> tuple[int, ...]:
     """The axes along which neighbouring texels of an (h, w, 3) uint8 image differ most and least. In 127ths."""
-    rows, below = np.ascontiguousarray(image[:-1:_EVERY]), np.ascontiguousarray(image[1::_EVERY])
+    every = max(image.shape[0] * image.shape[1] // _TEXELS, _EVERY)
+    rows, below = np.ascontiguousarray(image[:-1:every]), np.ascontiguousarray(image[1::every])
     varied, steps = np.zeros((3, 3)), list[tuple[NDArray[Any], NDArray[Any]]]()
     for k in range(3 if rows.size and rows.shape[1] > 1 else 0):
         plane, plane_below = cv2.extractChannel(rows, k), cv2.extractChannel(below, k)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,10 +121,20 @@ def test_everything_there_is_can_be_asked_for(
     assert viewer.range_error_mm(look) == 0
 
 
+@pytest.mark.parametrize("explicit", [False, True])
+def test_a_second_thread_changes_nothing(scan: Scan, view: FirstView, explicit: bool) -> None:
+    look = Look(1, 0.62, 0.3, parameters=EXACT if explicit else None)
+    with ThreadPoolExecutor(1) as pool:
+        alone, beside = (plan_update(scan, view.state, look, "htj2k", pool=each) for each in (None, pool))
+    assert [coded.payload for coded in beside.coded] == [coded.payload for coded in alone.coded]
+    assert (beside.reason, beside.encodes, beside.texture_db) == (alone.reason, alone.encodes, alone.texture_db)
+    assert beside.settled().state.holdings.digest() == alone.settled().state.holdings.digest()
+
+
 def test_says_the_largest_error_left_in_the_window(scan: Scan, view: FirstView) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, 0.62, 0.3)
-    update = plan_update(scan, viewer.state, look, "htj2k")
+    update = plan_update(scan, viewer.state, look, "htj2k").settled()
     viewer.take(update)
     s = scan.spec
     region = region_round(look.u, look.v, look.window, s.width, s.height)
