@@ -32,7 +32,7 @@ OPENED_BYTES = 600  # the message before it, at most
 OVERHEAD_BYTES = HEADER.size + CRC.size + FRAME_BYTES
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FirstView:
     """What every client of a scan receives first, range then texture, as refinements of epoch 0."""
 
@@ -40,6 +40,9 @@ class FirstView:
     range: Refinement
     texture: Refinement
     state: ClientState
+
+    def __repr__(self) -> str:
+        return f"FirstView({self.info.id})"
 
     def refinements(self, epoch: int) -> tuple[bytes, bytes]:
         """Both refinements on the wire, for one opening."""

@@ -62,7 +62,7 @@ class ScanSummary:
     body_site: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Scan:
     """A published scan: immutable, every array read-only, its samples mapped from disk.
 
@@ -80,6 +80,9 @@ class Scan:
     filled: StepArray
     pyramid: tuple[ImageArray, ...]
     repairs: RepairArray
+
+    def __repr__(self) -> str:
+        return f"Scan({self.id})"  # nobody wants to read its samples
 
     @property
     def grid(self) -> Grid:

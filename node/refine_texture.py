@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -15,20 +14,17 @@ from node.coded import Coded, Part, fewest_strips, own_inside, region_lattice, r
 from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
-from node.texture_model import SPACINGS, TextureModel
+from node.texture_model import SPACINGS
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
-from protocol.grid import TEXTURE_BLOCK, BoolArray, FloatArray, ImageArray, IntArray
-from protocol.holdings import COARSE_RANK, RANK_MARGIN, ChannelHoldings, texture_rank
-from protocol.lattice import Channel, ChannelShape, Lattice, Parameters, mask_to_runs
+from protocol.grid import TEXTURE_BLOCK, ImageArray
+from protocol.holdings import ChannelHoldings, texture_rank
+from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
-from protocol.strips import Strips, blocks_of, build_strips, select_strips
+from protocol.strips import Strips, build_strips, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
-LISTED_SHARE = 0.1  # of a window held well enough already: from there on a bitmap saves more than it takes
-NEVER = 1 << 16  # a quality that there is not
-HELD_MARGIN = 0.95  # what is held is known block by block, not value by value
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -79,23 +75,22 @@ def code_texture_lattice(
     scan: Scan, state: ClientState, parameters: Parameters, quality: float, codec: TextureCodec, *, quick: bool = False
 ) -> Coded | None:
     """The same for a lattice that is given, at this quality: blocks that are held at a better one stay as they are."""
-    held, rank = state.holdings.channels[Channel.TEXTURE], texture_rank(int(quality))
-    strips = select_strips(build_strips(held.shape, parameters), held, rank)
-    if not strips:
-        return None
+    strips = select_texture_lattice(state, parameters, quality)
+    return code_texture_strips(scan, strips, quality, codec, quick=quick) if strips else None
+
+
+def select_texture_lattice(state: ClientState, parameters: Parameters, quality: float) -> Strips:
+    """What that would carry, if anything."""
+    held = state.holdings.channels[Channel.TEXTURE]
+    return select_strips(build_strips(held.shape, parameters), held, texture_rank(int(quality)))
+
+
+def code_texture_strips(scan: Scan, strips: Strips, quality: float, codec: TextureCodec, *, quick: bool) -> Coded:
+    """Encode what was selected."""
     texels = (texture_samples(scan, strip.selection) for strip in strips)
     payloads = (encode_texture(image, codec, quality, quick=quick) for image in texels)
     parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
-    return Coded(parts, rank, quality, codec)
-
-
-def listed_texture(state: ClientState, region: Region, target_mse: float) -> tuple[int, ...] | None:
-    """Runs over a region's blocks that list those not held well enough; None where nearly all are (F-07b)."""
-    held = state.holdings.channels[Channel.TEXTURE]
-    place = _place(held.shape.blocks, region)
-    touched = region.touched(TEXTURE_BLOCK)
-    good = touched & (held.rank[place] > COARSE_RANK) & (state.missed[place] <= target_mse)
-    return mask_to_runs(touched & ~good) if good[touched].mean() >= LISTED_SHARE else None
+    return Coded(parts, texture_rank(int(quality)), quality, codec)
 
 
 def select_texture(state: ClientState, region: Region, wanted: TextureParameters) -> tuple[Strips, int]:
@@ -146,6 +141,8 @@ def measured(coded: Coded) -> Coded:
 
 
 def _measured(part: Part, coded: Coded) -> Part:
+    if part.patch is not None:
+        return part
     texels = decode_texture(part.payload, TextureCodec(coded.codec), int(coded.quality), part.selection.sample_shape)
     return replace(part, patch=texture_patch(part.selection, texels))
 
@@ -185,108 +182,6 @@ def _bands(selection: Selection) -> Iterator[tuple[slice, float]]:
     for top in range(0, rows, TEXTURE_BLOCK):
         bottom = min(top + TEXTURE_BLOCK, rows)
         yield slice(top, bottom), shape.stride * math.sin(math.pi * (first + (top + bottom) / 2) / shape.height)
-
-
-def left_alone(state: ClientState, coded: Coded | None, region: Region) -> BoolArray:
-    """Which of a region's blocks a refinement (or none) leaves as they are. (rows, columns) of Region.blocks, bool"""
-    kept = np.ones(state.missed.shape, np.bool_)
-    if coded is not None:
-        kept.ravel()[blocks_of(coded.strips)] = False
-    return kept[_place(kept.shape, region)] & region.touched(TEXTURE_BLOCK)
-
-
-def held_error(
-    state: ClientState, kept: BoolArray, region: Region, model: TextureModel | None, target_mse: float, *, most: bool
-) -> tuple[float, float]:
-    """Squared error in some of a region's blocks as they are held, and of how many values.
-
-    kept : which, (rows, columns) of Region.blocks.   most : so much it may be; else what is to be expected, since
-    errors are known block by block, not value by value.
-    Blocks that were never measured count as the model expects them, or as just good enough without one.
-    """
-    if not kept.any():
-        return 0.0, 0
-    every_row, every_column = _place(state.missed.shape, region)
-    rows, across = np.nonzero(kept)
-    rows, across = every_row.ravel()[rows], every_column.ravel()[across]
-    mse = state.missed[rows, across].astype(np.float64)
-    unknown = np.isnan(mse)
-    if model is None:
-        mse[unknown] = target_mse
-    elif unknown.any():
-        quality = state.holdings.channels[Channel.TEXTURE].rank[rows, across].astype(np.int64) - 1
-        mse[unknown] = model.mse_at(rows[unknown], across[unknown], quality[unknown])
-    shape = state.shapes[Channel.TEXTURE]
-    inside = _values_inside(shape, region, rows, across)
-    error = float(inside @ mse)
-    if most:
-        beyond = np.maximum(mse - target_mse, 0.0)  # of a block that is cut, all of it may lie inside
-        error = float(error + (_values_of(shape, rows, across) - inside) @ beyond) / HELD_MARGIN
-    return error, float(inside.sum())
-
-
-def quality_needed(state: ClientState, region: Region, p: float) -> IntArray:
-    """The lowest quality at which a spacing would be adopted in each of a region's blocks (F-09c).
-
-    NEVER where it would not be, since they are held finer. (rows, columns) of Region.blocks.
-    """
-    held, place = state.holdings.channels[Channel.TEXTURE], _place(state.missed.shape, region)
-    level, sent = held.level[place].astype(np.int64), math.ceil(2 * math.log2(p))
-    quality = held.rank[place].astype(np.int64) - 1
-    same = np.where(level == sent, quality + RANK_MARGIN[Channel.TEXTURE], quality)
-    return np.where(level < sent, NEVER, same)
-
-
-def quality_to_mend(state: ClientState, kept: BoolArray, region: Region, p: float, target_mse: float) -> int:
-    """The quality at which the too poor of the blocks that are kept would be sent again at a spacing; 0: none is."""
-    poor = kept & (state.missed[_place(state.missed.shape, region)] > target_mse)
-    needed = quality_needed(state, region, p)[poor]
-    return int(needed[needed < NEVER].max(initial=0))
-
-
-def _place(blocks: tuple[int, ...], region: Region) -> tuple[IntArray, IntArray]:
-    """Index of a region's blocks, those of Region.blocks."""
-    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    rows, columns = np.ix_(np.arange(top, top + high), np.arange(left, left + wide) % blocks[1])
-    return rows, columns
-
-
-def _values_of(shape: ChannelShape, rows: IntArray, columns: IntArray) -> FloatArray:
-    """How many values each block has, those of the equator's size."""
-    high = np.minimum(TEXTURE_BLOCK, shape.height - rows * TEXTURE_BLOCK)
-    wide = np.minimum(TEXTURE_BLOCK, shape.width - columns * TEXTURE_BLOCK)
-    narrow = np.sin(np.pi * (rows * TEXTURE_BLOCK + high / 2) / shape.height) if shape.sphere else 1.0
-    return np.asarray(3.0 * high * wide * narrow)
-
-
-def _values_inside(shape: ChannelShape, region: Region, rows: IntArray, columns: IntArray) -> FloatArray:
-    """How many of each block's values lie in a region."""
-    if shape.sphere:
-        return np.asarray(_share_inside(region, shape)[rows, columns] * _values_of(shape, rows, columns))
-    top, left = rows * TEXTURE_BLOCK, columns * TEXTURE_BLOCK
-    bottom = np.minimum(top + TEXTURE_BLOCK, shape.height)
-    size = np.minimum(TEXTURE_BLOCK, shape.width - left)
-    height = np.minimum(bottom, region.top + region.height) - np.maximum(top, region.top)
-    across = (left[:, None] + np.arange(TEXTURE_BLOCK) - region.left) % region.turn < region.width
-    width = (across & (np.arange(TEXTURE_BLOCK) < size[:, None])).sum(axis=1)
-    return np.asarray(3.0 * np.maximum(height, 0) * width)
-
-
-@lru_cache(maxsize=16)
-def _share_inside(region: Region, shape: ChannelShape) -> FloatArray:
-    """Which share of each block of a texture lies in a region. (rows, columns) of all blocks"""
-    left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    turn, columns = divmod(left + np.arange(wide), shape.blocks[1])
-    starts = turn * shape.width + columns * TEXTURE_BLOCK  # not wrapped
-    sizes = np.minimum(TEXTURE_BLOCK, shape.width - columns * TEXTURE_BLOCK)
-    rows = np.arange(top * TEXTURE_BLOCK, min((top + high) * TEXTURE_BLOCK, shape.height))
-    inside = region.inside(rows, np.arange(starts[0], starts[-1] + sizes[-1])).astype(np.int64)
-    across = np.add.reduceat(inside, starts - starts[0], axis=1)
-    counts = np.add.reduceat(across, np.arange(0, rows.size, TEXTURE_BLOCK), axis=0)
-    heights = np.minimum(TEXTURE_BLOCK, shape.height - (top + np.arange(high)) * TEXTURE_BLOCK)
-    share = np.zeros(shape.blocks)
-    share[_place(shape.blocks, region)] = counts / np.multiply.outer(heights, sizes)
-    return share
 
 
 def mse_of_db(db: float) -> float:

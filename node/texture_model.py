@@ -126,6 +126,43 @@ class _Measured:
         self.bias = 1.0
 
 
+class Place:
+    """A region of a texture, of which some blocks may be sent."""
+
+    def __init__(
+        self,
+        measured: _Measured,
+        content: NDArray[np.float32],
+        mse: NDArray[np.float32],
+        stride: IntArray,
+        sent: IntArray,
+    ) -> None:
+        self._measured, self._content, self._mse, self._area = measured, content, mse, 1.0 / stride
+        self._denser = STRETCHED * np.log2(stride / sent)
+        self._images = 1 + np.count_nonzero(np.diff(sent))
+        self._is_even = bool((stride == 1).all())
+
+    def expect(self, among: BoolArray) -> Expected:
+        """What some blocks, (rows, columns) of Region.blocks, will take and reach."""
+        content, mse = self._sums(among)
+        area = float(self._area @ among.sum(axis=1))
+        log_mse = np.log(np.maximum(mse / area, MSE_MIN)) if area else 0 * mse
+        size_bytes = (content + self._images * self._measured.constant) * self._measured.bias
+        return Expected(self._measured.qualities, log_mse, np.log(np.maximum(size_bytes, 1.0)))
+
+    def _sums(self, among: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Bytes and, by area, squared error at each quality. (qualities,) each"""
+        counted = among.astype(np.float32)
+        if self._is_even:
+            content, mse = (values.reshape(len(values), -1) @ counted.ravel() for values in (self._content, self._mse))
+            return content.astype(np.float64), mse.astype(np.float64)
+        content, mse = (
+            np.einsum("qrc,rc->qr", values, counted).astype(np.float64) for values in (self._content, self._mse)
+        )
+        qualities = self._measured.qualities
+        return _shifted(qualities, content, self._denser), _shifted(qualities, mse * self._area, self._denser)
+
+
 class TextureModel:
     """Expected bytes and error of any region of one scan's texture. Safe to use from several threads.
 
@@ -150,7 +187,6 @@ class TextureModel:
             self._first_mse[:] = _cell_errors(texture, first_view)
         self._lock = threading.Lock()
         self._stride = ring_strides(width, height, CELL) if sphere else np.ones(self._cells[0], np.int64)
-        self._area = 1.0 / self._stride
         self._measured = {
             (codec, p): _Measured(codec, p, self._cells) for codec in QUALITIES for p in SPACINGS
         }
@@ -170,24 +206,15 @@ class TextureModel:
         p : one of SPACINGS.   among : (rows, columns) of Region.blocks, bool; None: all that it touches.
         strides : of the strips that they travel in.
         """
+        return self.place(region, codec, p, strides).expect(region.touched(CELL) if among is None else among)
+
+    def place(self, region: Region, codec: TextureCodec, p: int = 1, strides: tuple[int, ...] = STRIDES) -> Place:
+        """The same region again and again, each time with other blocks of it; arguments as of `expect`."""
         measured = self._measured[codec, p]
         left, top, wide, high = region.blocks(CELL)
         rows, columns = slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
-        among = region.touched(CELL) if among is None else among
-        counted = among.astype(np.float32)
-        content, mse = (
-            np.einsum("qrc,rc->qr", values[:, rows].take(columns, axis=2), counted).astype(np.float64)
-            for values in (measured.content, measured.mse)
-        )
-        mse *= self._area[rows]
-        area = self._area[rows] @ among.sum(axis=1)
-        sent = limited_strides(self._stride[rows], strides)
-        denser = STRETCHED * np.log2(self._stride[rows] / sent)
-        content, mse = (_shifted(measured.qualities, values, denser) for values in (content, mse))
-        images = 1 + np.count_nonzero(np.diff(sent))
-        log_mse = np.log(np.maximum(mse / area, MSE_MIN)) if area else 0 * mse
-        size_bytes = (content + images * measured.constant) * measured.bias
-        return Expected(measured.qualities, log_mse, np.log(np.maximum(size_bytes, 1.0)))
+        content, mse = (values[:, rows].take(columns, axis=2) for values in (measured.content, measured.mse))
+        return Place(measured, content, mse, self._stride[rows], limited_strides(self._stride[rows], strides))
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
         """Squared error per value of single blocks at qualities of their own; -1 is the first view. (n,) each"""

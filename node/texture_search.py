@@ -11,42 +11,43 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
 
 from node.coded import Coded, fewest_strips, framed, message_overhead
+from node.held_texture import HELD_MARGIN, HeldTexture
 from node.library import Scan
 from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
     CODECS,
-    HELD_MARGIN,
     adopted_error,
     choose_spacing,
-    code_texture_lattice,
-    held_error,
-    left_alone,
-    listed_texture,
+    code_texture_strips,
     measured,
     mse_of_db,
     quality_bounds,
-    quality_needed,
-    quality_to_mend,
+    select_texture_lattice,
     texture_lattice,
 )
 from node.state import ClientState
-from node.texture_model import SPACINGS, Expected, TextureModel
-from protocol.codec import SIXTEENTHS
+from node.texture_model import SPACINGS, Expected, Place, TextureModel
+from protocol.codec import LOSSLESS, SIXTEENTHS
 from protocol.grid import TEXTURE_BLOCK, BoolArray
 from protocol.lattice import Channel, Parameters, runs_to_mask
 from protocol.messages import CodecName, Look, TextureParameters
 from protocol.region import Region
+from protocol.strips import Strips
 
 SKIRT_S = 1.0
 GRAINS = {"htj2k": 1 / SIXTEENTHS, "jpeg": 1.0}  # by how much qualities of a codec can differ
-WHOLE_SHARE = 0.7  # of what a whole window takes: where a part takes more, the whole is tried too
 FINEST_SHARE = 1.03  # of what another spacing takes: up to there spacing 1 is preferred
 POOR = (1, 2, 4, 16)  # times the error allowed: blocks that are held no better may be sent again
+FAR = 16  # steps of quality above the first guess, from where a closer spacing serves better
 SPOILT_SHARE = 0.6  # of the error allowed: blocks that stay may take so much of what those that are sent may have
 GENERIC_BYTES_PER_TEXEL = 0.04
 NO_TEXTURE = 16.0  # how much larger than wanted an error is left where no texture is sent, until it is known
+Carried = tuple[tuple[int, int, bytes], ...]
 OVERHEAD_BYTES = framed(message_overhead(Parameters(2, 0, 0, 1, 1)))
 
 
@@ -85,7 +86,10 @@ class TextureSearch:
         self._target_mse = mse_of_db(look.texture_db)
         self._lowest, self._highest = quality_bounds(codec)
         self._grain = GRAINS[codec]
+        self._places: dict[int, Place] = {}
         self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
+        self._least: dict[tuple[int, tuple[int, ...] | None], int] = {}
+        self._tried: dict[tuple[int, float, Carried], Coded] = {}
         self.limited = False
         self.mse: float | None = None
 
@@ -93,6 +97,11 @@ class TextureSearch:
     def _strides(self) -> tuple[int, ...]:
         """Of the strips that texture travels in."""
         return fewest_strips(self._state.shapes[Channel.TEXTURE], self._region)
+
+    @cached_property
+    def _held(self) -> HeldTexture:
+        """What the client has of the window."""
+        return HeldTexture(self._state, self._region, self._model, self._target_mse)
 
     @cached_property
     def _held_mse(self) -> float:
@@ -114,21 +123,16 @@ class TextureSearch:
             return None
         listed = self._listing(aim_bytes)
         found = self._search_spacings(aim_bytes, limit_bytes, listed)
-        if listed is None or found is None or found.wire_bytes < WHOLE_SHARE * self._expected_whole_bytes():
-            return found
-        reached = self._left()
-        whole = self._search_spacings(aim_bytes, limit_bytes, None)  # one quality all over may cost less than parts do
-        if whole is not None and whole.wire_bytes < found.wire_bytes and self._left() <= max(reached, self._target_mse):
-            return whole
-        self.mse = reached if math.isfinite(reached) else None
-        return found
+        return found if listed is None or found is None else self._unlisted(found)
 
-    def _left(self) -> float:
-        return math.inf if self.mse is None else self.mse
+    def _unlisted(self, coded: Coded) -> Coded:
+        """The same without a list of blocks, where that makes no difference to which are changed."""
+        strips = select_texture_lattice(self._state, self._lattice(coded.parameters.half_spacing // 2), coded.quality)
+        return _of_strips(coded, strips) if _carried(strips) == _carried(coded.strips) else coded
 
     def _listing(self, aim_bytes: float) -> tuple[int, ...] | None:
         """Which blocks to send: those that are not good enough, or fewer and these better, or all (None)."""
-        poor = (listed_texture(self._state, self._region, worse * self._target_mse) for worse in POOR)
+        poor = (self._held.listed(worse * self._target_mse) for worse in POOR)
         listings = {listed for listed in poor if listed is not None}
         if not listings or self._model is None:
             return next(iter(listings), None)
@@ -155,29 +159,41 @@ class TextureSearch:
         return self._known[p, listed]
 
     def _expect(self, p: int, listed: tuple[int, ...] | None) -> Expected:
+        """The same, worked out.
+
+        Which blocks are changed jumps with the quality, as those held finer or better stay. What counts are the blocks
+        changed between the two jumps where the target is reached first.
+        """
         if self._model is None:
+            self._least[p, listed] = self._lowest
             return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
-        touched = self._region.touched(TEXTURE_BLOCK)
-        among = touched if listed is None else self._blocks(listed)
-        expected = self._model.expect(self._region, CODECS[self._codec], p, among, self._strides)
-        needed = quality_needed(self._state, self._region, p)
-        adopted = among & (needed <= expected.quality_for_mse(MARGIN * self._target_mse))
-        if not adopted.any():
-            adopted = among
-        if adopted.sum() < among.sum():
-            expected = self._model.expect(self._region, CODECS[self._codec], p, adopted, self._strides)
-        if adopted.sum() == touched.sum():
+        among = self._held.touched if listed is None else self._blocks(listed)
+        needed = self._held.quality_needed(p)
+        jumps = np.unique(np.clip(needed[among], self._lowest, self._highest)).tolist()
+        for begin, stop in pairwise([*(jumps or [self._lowest]), LOSSLESS]):
+            sent = among & (needed <= begin)
+            expected, self._least[p, listed] = self._expect_sent(p, sent if sent.any() else among), begin
+            if expected.quality_for_mse(MARGIN * self._target_mse) < stop:
+                break
+        return expected
+
+    def _expect_sent(self, p: int, sent: BoolArray) -> Expected:
+        """What some blocks take at a spacing, and leave in the window with the others as they are held."""
+        expected, kept = self._place(p).expect(sent), self._held.touched & ~sent
+        if not kept.any():
             return expected
-        kept_error, kept = self._held_error(~adopted & touched)
-        return expected.beside(1 - kept / max(3 * self._region.area, kept), kept_error / max(kept, 1))
+        kept_error, values = self._held.error(kept, most=True)
+        return expected.beside(1 - values / max(3 * self._region.area, values), kept_error / max(values, 1))
+
+    def _place(self, p: int) -> Place:
+        assert self._model is not None  # else nobody asks
+        if p not in self._places:
+            self._places[p] = self._model.place(self._region, CODECS[self._codec], p, self._strides)
+        return self._places[p]
 
     def _blocks(self, listed: tuple[int, ...]) -> BoolArray:
         _, _, wide, high = self._region.blocks(TEXTURE_BLOCK)
         return runs_to_mask(listed, wide * high).reshape(high, wide)
-
-    def _expected_whole_bytes(self) -> float:
-        expected = self._expected(1, None)
-        return expected.size_bytes(expected.quality_for_mse(self._target_mse))
 
     def _choose(self, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
         """The spacing that takes least to reach the target; where none does, the one that comes nearest to it.
@@ -201,7 +217,7 @@ class TextureSearch:
     def _offer(self, p: int, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
         """What a spacing can do for so many bytes of payload; None where it fits at no quality."""
         expected = self._expected(p, listed)
-        wanted = max(ceiled(expected.quality_for_mse(MARGIN * self._target_mse), self._grain), self._lowest)
+        wanted = max(ceiled(expected.quality_for_mse(MARGIN * self._target_mse), self._grain), self._least[p, listed])
         quality = min(wanted, self._highest)
         if math.isfinite(aim_bytes):
             quality = min(quality, floored(expected.quality_for_bytes(aim_bytes), self._grain))
@@ -219,8 +235,12 @@ class TextureSearch:
         p = choice.p if choice else 0
         best: Point | None = None
         while p in SPACINGS:
-            bounds = aim_bytes - OVERHEAD_BYTES, limit_bytes - OVERHEAD_BYTES, self._expected(p, listed)
-            search = QualitySearch(self._target_mse, *bounds, self._lowest, self._highest, self._tries, self._grain)
+            expected, highest = self._expected(p, listed), self._highest
+            if p > 1:
+                highest = min(highest, math.ceil(expected.quality_for_mse(MARGIN * self._target_mse)) + FAR)
+            bounds = aim_bytes - OVERHEAD_BYTES, limit_bytes - OVERHEAD_BYTES
+            lowest = self._least[p, listed] if math.isinf(limit_bytes) else self._lowest
+            search = QualitySearch(self._target_mse, *bounds, expected, lowest, highest, self._tries, self._grain)
             if not self._try_qualities(search, p, listed):
                 return None
             self.limited |= search.limited
@@ -247,54 +267,77 @@ class TextureSearch:
                 search.missed_all(quality, self._mending_quality(p, None))
                 continue
             if search.fits(coded):
-                coded = measured(coded)
+                coded = self._measured(p, coded)
                 mse = self._error(coded)
                 search.measured(Point(quality, mse, coded))
                 if mse > self._target_mse and self._spoilt(coded):
                     search.at_least(self._mending_quality(p, coded))
             else:
                 search.too_large(quality, len(coded.payload))
-            self._learn(p, coded)
+                self._learn(p, coded)
         return True
 
     def _code(self, p: int, quality: float, listed: tuple[int, ...] | None) -> Coded | None:
-        self._encodes.add()
-        wanted = TextureParameters(p, int(quality), self._codec, self.skirt(p))
-        parameters = texture_lattice(self._state, self._region, wanted)
+        """Encode a try; what is the same as an earlier one but for how its blocks are told has its payload."""
+        parameters = self._lattice(p)
         if listed is not None:
             parameters = replace(parameters, listed=listed)
-        return code_texture_lattice(
-            self._scan, self._state, parameters, quality, CODECS[self._codec], quick=self._quick
-        )
+        strips = select_texture_lattice(self._state, parameters, quality)
+        if not strips:
+            return None
+        earlier = self._tried.get((p, quality, _carried(strips)))
+        if earlier is not None:
+            return _of_strips(earlier, strips)
+        self._encodes.add()
+        return code_texture_strips(self._scan, strips, quality, CODECS[self._codec], quick=self._quick)
+
+    def _lattice(self, p: int) -> Parameters:
+        """Of the whole window at a spacing."""
+        return texture_lattice(self._state, self._region, TextureParameters(p, s=self.skirt(p)))
+
+    def _measured(self, p: int, coded: Coded) -> Coded:
+        """A try with what a client makes of it, and noted, so that it is not made again."""
+        coded = measured(coded)
+        self._tried[p, coded.quality, _carried(coded.strips)] = coded
+        self._learn(p, coded)
+        return coded
 
     def _spoilt(self, coded: Coded) -> bool:
         """Whether blocks that a refinement leaves as they are have so much of the error allowed that it is worth more
         to send them too than to send the others better."""
-        kept_error, kept = self._held_error(left_alone(self._state, coded, self._region))
+        kept_error, kept = self._held.error(self._held.left_alone(coded), most=True)
         sent = max(3 * self._region.area - kept, 0)
         return kept_error > self._target_mse * (kept + sent * SPOILT_SHARE)
 
     def _mending_quality(self, p: int, coded: Coded | None) -> int:
-        kept = left_alone(self._state, coded, self._region)
-        return quality_to_mend(self._state, kept, self._region, p, self._target_mse)
+        return self._held.quality_to_mend(self._held.left_alone(coded), p)
 
     def _error(self, coded: Coded | None) -> float:
         """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""
         total, count = 0.0, 0.0
         if coded is not None:
             total, count = adopted_error(self._scan, coded, self._region)
-        kept = left_alone(self._state, coded, self._region)
-        held_total, held_count = self._held_error(kept, most=coded is not None)
+        held_total, held_count = self._held.error(self._held.left_alone(coded), most=coded is not None)
         return (total + held_total) / max(count + held_count, 1)
 
-    def _held_error(self, kept: BoolArray, *, most: bool = True) -> tuple[float, float]:
-        return held_error(self._state, kept, self._region, self._model, self._target_mse, most=most)
+    def _sent(self, coded: Coded) -> BoolArray:
+        """Which of the window's blocks a refinement changes."""
+        return self._held.touched & ~self._held.left_alone(coded)
 
     def _learn(self, p: int, coded: Coded) -> None:
         """Tell the model what a refinement took, where a skirt is not what took it."""
         if self._model is not None and self._look.alpha is None:
-            codec = CODECS[self._codec]
-            sent = self._region.touched(TEXTURE_BLOCK) & ~left_alone(self._state, coded, self._region)
-            expected = self._model.expect(self._region, codec, p, sent, self._strides)
-            self._model.learn(codec, p, expected.size_bytes(coded.quality), len(coded.payload))
+            expected = self._place(p).expect(self._sent(coded))
+            self._model.learn(CODECS[self._codec], p, expected.size_bytes(coded.quality), len(coded.payload))
             self._known.clear()
+
+
+def _of_strips(coded: Coded, strips: Strips) -> Coded:
+    """A refinement told by strips of another lattice, which carry the same."""
+    parts = zip(coded.parts, strips, strict=True)
+    return replace(coded, parts=tuple(replace(part, strip=strip) for part, strip in parts))
+
+
+def _carried(strips: Strips) -> Carried:
+    """Tells strips of lattices that differ in what they list by the blocks that they carry."""
+    return tuple((strip.selection.y.start, strip.selection.x.start, strip.adopted.tobytes()) for strip in strips)

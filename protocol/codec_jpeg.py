@@ -15,7 +15,6 @@ from __future__ import annotations
 import struct
 from functools import lru_cache
 
-import cv2
 import imagecodecs
 import numpy as np
 
@@ -86,14 +85,8 @@ def quantisation(base: bytes, jpeg_q: int) -> bytes:
 
 
 def _encode(image: ImageArray, jpeg_q: int, fit_tables: bool) -> bytes:
-    settings = (
-        (cv2.IMWRITE_JPEG_QUALITY, jpeg_q),
-        (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
-        (cv2.IMWRITE_JPEG_OPTIMIZE, int(fit_tables)),
-    )
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, buffer = cv2.imencode(".jpg", bgr, [number for setting in settings for number in setting])
-    return _strip(buffer.tobytes(), frame_header(image.shape[:2], jpeg_q))
+    stream = imagecodecs.jpeg8_encode(np.ascontiguousarray(image), jpeg_q, subsampling="444", optimize=fit_tables)
+    return _strip(bytes(stream), frame_header(image.shape[:2], jpeg_q))
 
 
 def _strip(stream: bytes, head: bytes) -> bytes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ WINDOW = 0.05
 QUALITY = 42  # reaches 40 dB on a skin-like texture
 FIRST_VIEW_BYTES = 32768
 CODECS: tuple[CodecName, ...] = ("jpeg", "htj2k")
+THREADS = ThreadPoolExecutor(1, "encode")  # that a node has beside the one that plans
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,8 @@ def after_last_column(grid: Grid, repeats: int) -> dict[str, float]:
 
 
 def update(scan: Scan, case: Case, click: tuple[float, float], repeats: int) -> dict[str, Any]:
-    """Planning, encoding and packing one update, and applying it, against OpenCV's JPEG of the same patch."""
+    """Planning, encoding and packing one update, in two threads as in a node, and applying it, against OpenCV's JPEG of
+    the same patch."""
     view = build_first_view(scan, case.codec, FIRST_VIEW_BYTES)
     look = case.look(*click)
     patch = texture_patch_sent(scan, view, look)
@@ -253,7 +256,7 @@ def _fresh(model: Model) -> Model:
 
 
 def _plan(scan: Scan, view: FirstView, look: Look, case: Case) -> tuple[Update, list[Refinement]]:
-    planned = plan_update(scan, view.state, look, case.codec, quick=case.quick)
+    planned = plan_update(scan, view.state, look, case.codec, quick=case.quick, pool=THREADS)
     refinements = [coded.refinement(1, seq + 2, look.request) for seq, coded in enumerate(planned.coded)]
     for refinement in refinements:
         refinement.to_bytes()

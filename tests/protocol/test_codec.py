@@ -178,9 +178,9 @@ def test_libjpeg_writes_the_headers_that_are_rebuilt(shape: tuple[int, int]) -> 
 
 def test_an_encoder_with_other_headers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     strange_j2k = bytes(imagecodecs.htj2k_encode(texture((32, 32)), resolutions=1))
-    strange_jpeg = cv2.imencode(".jpg", texture((32, 32)), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    strange_jpeg = cv2.imencode(".jpg", texture((32, 32)), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
     monkeypatch.setattr(imagecodecs, "htj2k_encode", lambda *_, **__: strange_j2k)
-    monkeypatch.setattr(cv2, "imencode", lambda *_: strange_jpeg)
+    monkeypatch.setattr(imagecodecs, "jpeg8_encode", lambda *_, **__: strange_jpeg)
     for kind in TextureCodec:
         with pytest.raises(CodecError, match="would not rebuild"):
             codec.encode_texture(texture((32, 32)), kind, 40)
