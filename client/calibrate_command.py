@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from client.arguments import add_node, between, chosen_node
 from client.scan_command import record_of, sweep_once
+from protocol.errors import UsageError
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -42,6 +43,10 @@ def run_calibrate(args: argparse.Namespace) -> int:
 
     from client.axis import forget_axis, known_axes
 
+    if args.scan is not None and args.diameter is None:
+        raise UsageError("--scan: goes with --diameter; the other two look at no scan")
+    if args.forget is not None and not args.forget.strip():
+        raise UsageError("--forget: which scanner? --list says the serial numbers")
     if args.list:
         axes = asyncio.run(_at_node(args, known_axes))
         for known in axes:

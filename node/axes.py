@@ -64,7 +64,7 @@ class Axes:
         self._lock = threading.Lock()
         self._known: dict[str, KnownAxis] = {}
         self._trouble = self._told_of_spoilt()
-        self._is_spoilt = False
+        self._damaged = ""
         try:
             self._path.with_name(FILE + NEW).unlink(missing_ok=True)
             kept = decode_kept(read_bounded(self._path, FILE_BYTES_MAX), _Kept, f"its {FILE}")
@@ -74,9 +74,14 @@ class Axes:
         except FileNotFoundError:
             pass
         except (OSError, LibraryError) as error:
-            self._is_spoilt = True
+            self._damaged = f"{FILE} cannot be read, so sweeps are not corrected for an axis: calibrate again"
             self._trouble = f"not corrected for the scanner's axis, as {FILE} cannot be read: calibrate again"
             log.warning("%s (%s)", self._trouble, error)
+
+    @property
+    def damaged(self) -> str:
+        """What keeps the file of them from being read, since the start and until one is kept; "" where nothing does."""
+        return self._damaged
 
     def known(self) -> tuple[KnownAxis, ...]:
         """All of them, those calibrated last behind."""
@@ -109,9 +114,9 @@ class Axes:
 
     def _write(self, axes: list[KnownAxis]) -> None:
         try:
-            if self._is_spoilt:
+            if self._damaged:
                 os.replace(self._path, self._path.with_name(SPOILT))
-                self._is_spoilt = False
+                self._damaged = ""
             write_whole(self._path, msgspec.json.format(msgspec.json.encode(_Kept(FORMAT, tuple(axes)))))
         except OSError as error:
             raise disk_error("cannot keep the scanner's axis", error) from error

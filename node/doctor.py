@@ -84,10 +84,16 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     except ConfigError as error:
         yield Finding("configuration", "problem", str(error), "correct the setting named; the rest was not looked at")
         return
-    if left := leftovers(place):
+    try:
+        left, shut = leftovers(place), why_shut(place)
+    except OSError as error:
+        found = f"whether it is sealed cannot be seen: {error.filename or place}: {error.strerror}"
+        yield Finding("library", "problem", f"{found}; the rest was not looked at", "ask as root or as its owner")
+        return
+    if left:
         found = f"left by a seal or an unseal that was cut, if none runs: {', '.join(map(str, left))}"
         yield Finding("library", "warning", found, f"stop the node, and {finish(place)}")
-    if shut := why_shut(place):
+    if shut:
         yield Finding("library", "problem", f"{shut[0]}; the rest was not looked at", shut[1])
         return
     library = config.library.path

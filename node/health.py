@@ -47,6 +47,7 @@ def examine_health(
         *filter(None, (stuck(parts, STUCK_S),)),
         *_of_disk(library),
         *_of_library(library),
+        *filter(None, (library.axes.damaged,)),
         *((f"the audit log cannot be written: {audit_trouble}",) if audit_trouble else ()),
         *_of_certificate(certificate_end_unix_s, now_unix_s),
     )

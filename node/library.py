@@ -38,6 +38,7 @@ from node.scan_folder import (
     write_record,
     write_scan,
 )
+from node.sealed import has_died
 from node.sidecar import FILE as SIDECAR_FILE
 from node.sidecar import Changes, Sidecar, change_sidecar, read_sidecar
 from protocol.errors import LibraryError
@@ -272,6 +273,8 @@ class Library:
         try:
             grid = read_sound_grid(self.folder / scan_id, summary.spec)
         except LibraryError as error:
+            if has_died(error):
+                raise
             self._forget(scan_id)
             self._problems = (*self._problems, Problem(scan_id, str(error)))
             raise LibraryError(f"scan {scan_id} is damaged: {error}") from error
@@ -309,13 +312,18 @@ def survey(folder: Path) -> tuple[dict[str, ScanSummary], tuple[Problem, ...]]:
 
 
 def verify(folder: Path, scan_ids: list[str]) -> Iterator[tuple[str, Problem | None]]:
-    """Check every sample of some scans, and what is said of them; needs no lock. Yields (id, what is wrong or None)."""
+    """Check every sample of some scans, and what is said of them; needs no lock. Yields (id, what is wrong or None).
+
+    Raises LibraryError when they cannot be looked at, since what had opened a sealed library has died.
+    """
     for scan_id in scan_ids:
         try:
             read_sound_grid(folder / scan_id, read_record(folder / scan_id).spec)
             read_sidecar(folder / scan_id)
             yield scan_id, None
         except LibraryError as error:
+            if has_died(error):
+                raise
             yield scan_id, Problem(scan_id, str(error))
 
 

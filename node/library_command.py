@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from node.retention import Expired
 
 SCAN_HELP = "the id, the beginning of one, or latest"
+NO_LINK = "foveascan-vault cannot open it there, use a bind mount instead (README, \"A sealed library\")"
 
 
 def add_library_command(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -215,7 +216,11 @@ def run_seal(args: argparse.Namespace) -> int:
     """Encrypt the library."""
     from node.sealing import seal
 
-    return _change_seal(args, seal, "sealed")
+    status = _change_seal(args, seal, "sealed")
+    library = _config(args).library
+    if Path(library.folder).expanduser().is_symlink():
+        print(f"foveascan: {library.folder} is a link to {library.place}: {NO_LINK}", file=sys.stderr)
+    return status
 
 
 def run_unseal(args: argparse.Namespace) -> int:
@@ -230,12 +235,16 @@ def _change_seal(
 ) -> int:
     from tqdm import tqdm
 
-    from node.sealed import read_key
+    from node.sealed import read_key, standing
     from node.sealing import size_bytes
 
     folder, key = _config(args).library.place, read_key(Path(args.key))
-    with tqdm(total=size_bytes(folder), disable=None, leave=False, unit="B", unit_scale=True) as bar:
-        change(folder, key, bar.update)
+    try:
+        with tqdm(total=size_bytes(folder), disable=None, leave=False, unit="B", unit_scale=True) as bar:
+            change(folder, key, bar.update)
+    except KeyboardInterrupt:
+        print(f"foveascan: interrupted: {standing(folder)}", file=sys.stderr)
+        raise
     return _tell(args, {done: str(folder)}, f"{done} {folder}")
 
 

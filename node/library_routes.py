@@ -33,6 +33,7 @@ from node.journal import Interrupted
 from node.library import Library, verify
 from node.partial import write_partial
 from node.rest import said
+from node.sealed import HAS_DIED, has_died
 from node.sidecar import BY_MAX, Conflict, Sidecar, changed_fields, decode_changes
 from node.spool import send, spool
 from protocol.errors import LibraryError
@@ -156,6 +157,8 @@ def explained() -> Iterator[None]:
     except NoRoom as error:
         raise web.HTTPInsufficientStorage(text=str(error)) from error
     except LibraryError as error:
+        if has_died(error):
+            raise web.HTTPServiceUnavailable(text=HAS_DIED) from error
         raise web.HTTPInternalServerError(text=str(error)) from error
 
 

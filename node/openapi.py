@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from http import HTTPStatus
@@ -46,6 +47,7 @@ def _operation(endpoint: Endpoint, schemas: Mapping[Any, Schema], components: Ma
     """What OpenAPI calls an operation."""
     least = f"Needs the role {endpoint.role}." if endpoint.role else "For anybody."
     operation: Schema = {
+        "operationId": _name(endpoint),
         "summary": endpoint.does,
         "description": least,
         "security": [{name: []} for name in LOGINS] if endpoint.role else [],
@@ -58,6 +60,12 @@ def _operation(endpoint: Endpoint, schemas: Mapping[Any, Schema], components: Ma
     if endpoint.takes:
         operation["requestBody"] = {"required": True, **_content(endpoint.takes, schemas)}
     return operation
+
+
+def _name(endpoint: Endpoint) -> str:
+    """What programs that are made of the description call it: method and path, so it is as stable as these are."""
+    words = re.findall(r"\w+", endpoint.canonical.removeprefix("/v1")) or ["page"]
+    return "_".join([endpoint.method.lower(), *words])
 
 
 def _parameters(

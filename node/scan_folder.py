@@ -127,9 +127,9 @@ def _spec_json(spec: GridSpec) -> bytes:
 
 def read_record(folder: Path) -> Record:
     """A scan's record, checked against the sizes of its files: reads no samples. Raises LibraryError."""
-    if not SCAN_ID.fullmatch(folder.name) or not folder.is_dir():
-        raise LibraryError("not a scan")
     try:
+        if not SCAN_ID.fullmatch(folder.name) or not folder.is_dir():
+            raise LibraryError("not a scan")
         record = decode_record(read_bounded(folder / RECORD_FILE, RECORD_BYTES_MAX))
     except OSError as error:
         raise LibraryError(f"its {RECORD_FILE} cannot be read: {error.strerror}") from error

@@ -19,7 +19,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from node.durable import read_bounded, sync_folder
@@ -35,6 +35,7 @@ STRETCH = "10"  # the least: a key is random, and nothing is won by making its t
 MOUNT_S = 30.0
 OPEN_IT = "systemctl start foveascan-vault, or mount it (README, \"A sealed library\")"
 OPEN_AGAIN = "systemctl restart foveascan-vault, or umount it and mount it again (README, \"A sealed library\")"
+HAS_DIED = "what had opened the library, which is sealed, has died: restart foveascan-vault on the node"
 LEFT = "away", "gone", "sealing", "coming"
 WRONG_KEY = 12  # gocryptfs's status
 _ESCAPED = {"\\040": " ", "\\011": "\t", "\\012": "\n", "\\134": "\\"}
@@ -56,8 +57,11 @@ def is_sealed(folder: Path) -> bool:
 
 
 def is_kept(sealed: Path) -> bool:
-    """Whether a folder is one that a key may open."""
-    return (sealed / CONF).exists()
+    """Whether a folder is one that a key may open, or may be for all that we may look into it. Raises OSError."""
+    try:
+        return (sealed / CONF).exists()
+    except PermissionError:
+        return sealed.is_dir()
 
 
 def is_open(folder: Path) -> bool:
@@ -96,6 +100,14 @@ def why_shut(folder: Path) -> tuple[str, str] | None:
     return None
 
 
+def has_died(error: BaseException) -> bool:
+    """Whether it came of this: what had opened a sealed library has died."""
+    cause: BaseException | None = error
+    while cause is not None and not (isinstance(cause, OSError) and cause.errno == errno.ENOTCONN):
+        cause = cause.__cause__
+    return cause is not None
+
+
 def _is_cut(folder: Path) -> bool:
     return any(beside(folder, word).exists() for word in ("away", "gone"))
 
@@ -103,6 +115,20 @@ def _is_cut(folder: Path) -> bool:
 def leftovers(folder: Path) -> list[Path]:
     """What a seal or an unseal that was cut has left beside a library; also what one has that runs."""
     return [place for word in LEFT if (place := beside(folder, word)).exists()]
+
+
+def standing(folder: Path) -> str:
+    """Where a seal or an unseal stands that was cut, and how to go on, in a line."""
+    left = {word: place for word in LEFT if (place := beside(folder, word)).exists()}
+    if "away" in left:
+        return f"all of {folder} is encrypted, and {left['away']} is still to be deleted; to end that: {finish(folder)}"
+    if "gone" in left:
+        return f"all of {folder} is in the clear, {left['gone']} is still to be deleted; to end that: {finish(folder)}"
+    was = f"{folder} is {'sealed' if is_sealed(folder) else 'in the clear'}, as it was"
+    if left:
+        part = next(iter(left.values()))
+        return f"{was}, and {part} is the part that was copied; to go on: {finish(folder)}; to let it be: rm -r {part}"
+    return was
 
 
 def finish(folder: Path) -> str:
@@ -141,8 +167,12 @@ def make_sealed(sealed: Path, key: bytes) -> None:
 
 
 def change_key(sealed: Path, old: bytes, new: bytes) -> None:
-    """Encrypt the data key with another one, at once; no scan is written. Raises LibraryError."""
-    _run("-passwd", "-scryptn", STRETCH, str(sealed), said=old + b"\n" + new)
+    """Encrypt the data key with another one, at once; no scan is written. Raises LibraryError.
+
+    It is one step, so who interrupts it comes too late.
+    """
+    with suppress(KeyboardInterrupt):
+        _run("-passwd", "-scryptn", STRETCH, str(sealed), said=old + b"\n" + new)
 
 
 @contextmanager
@@ -178,8 +208,11 @@ def shut(place: Path) -> None:
 
 
 def _started(command: list[str], errors: int) -> subprocess.Popen[bytes]:
+    """gocryptfs, which Ctrl-C does not reach: we end it in our order. Raises LibraryError."""
     try:
-        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors, process_group=0
+        )
     except FileNotFoundError:
         raise LibraryError("a sealed library needs gocryptfs; as root: apt-get install gocryptfs fuse3") from None
 
@@ -198,9 +231,16 @@ def _run(*arguments: str, said: bytes) -> None:
     """Have gocryptfs do something. said : lines for its standard input, so that no list of processes shows a key."""
     with tempfile.TemporaryFile() as errors:
         process = _started(["gocryptfs", "-q", "-nosyslog", *arguments], errors.fileno())
-        process.communicate(said + b"\n")
+        interrupt: KeyboardInterrupt | None = None
+        try:
+            process.communicate(said + b"\n")
+        except KeyboardInterrupt as pressed:
+            interrupt = pressed
+            process.wait()
         if process.returncode:
             raise _refusal(process.returncode, os.pread(errors.fileno(), 4096, 0))
+        if interrupt is not None:
+            raise interrupt
 
 
 def _refusal(status: int, said: bytes) -> LibraryError:

@@ -176,6 +176,8 @@ def _discard(folder: Path, words: tuple[str, ...], sealed: Path, key: bytes) -> 
 
 def rekey(folder: Path, old: bytes, new: bytes) -> None:
     """Give a sealed library another key, open or not. Raises LibraryError."""
+    if new == old:
+        raise LibraryError("the new key is the old one: nothing was changed")
     if not is_sealed(folder):
         raise LibraryError(f"{folder} is not sealed")
     change_key(sealed_folder(folder), old, new)

@@ -42,6 +42,7 @@ from node.proxy import believe
 from node.rest import harden, query_of, refusal, said
 from node.retention import delete, expired_in
 from node.scan_quality import told
+from node.sealed import HAS_DIED, has_died
 from node.shared import SharedFoveae
 from node.tls import Tls
 from protocol import messages as m
@@ -376,7 +377,7 @@ async def _explain(request: web.Request, handler: Handler) -> web.StreamResponse
     except NoRoom as error:
         return refusal(507, str(error))
     except LibraryError as error:
-        return refusal(404, str(error))
+        return refusal(503, HAS_DIED) if has_died(error) else refusal(404, str(error))
     except AccessError as error:
         log.error("%s", error)
         return refusal(503, "who may come in cannot be read")

@@ -12,6 +12,8 @@ from typing import BinaryIO
 
 from aiohttp import web
 
+from node.sealed import HAS_DIED, has_died
+
 CHUNK_BYTES = 1 << 18
 STALL_S = 60.0
 
@@ -46,6 +48,8 @@ def disk_trouble(problem: OSError) -> web.HTTPException:
     """What failed on the node's disk, in the terms of HTTP."""
     if isinstance(problem, ConnectionError):
         return web.HTTPBadRequest(text="the connection was lost")
+    if has_died(problem):
+        return web.HTTPServiceUnavailable(text=HAS_DIED)
     if problem.errno == errno.ENOSPC:
         return web.HTTPInsufficientStorage(text="the node's disk is full")
     return web.HTTPInternalServerError(text=f"the node's disk: {problem.strerror}")

@@ -19,7 +19,7 @@ from client.session import _checked_look
 from client.update import Tally
 from exchange.errors import ExchangeError
 from protocol import messages as m
-from protocol.errors import LocalWireError, RemoteWireError, ScannerFault
+from protocol.errors import LocalWireError, RemoteWireError, ScannerFault, UsageError
 from tests.client.scripted_node import Line, greet, serving_in_thread, show_and_answer, synthetic_grid
 
 GRID = synthetic_grid()
@@ -344,3 +344,14 @@ def test_what_is_no_list_of_scans_is_refused(said: Any) -> None:
 async def greet_and_wait(line: Line) -> None:
     await greet(line)
     await line.gone()
+
+
+@pytest.mark.parametrize("other", [("--list",), ("--forget", "SIM-0001")])
+def test_calibrate_takes_a_scan_with_a_diameter_only(other: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError, match="--scan: goes with --diameter"):
+        run("calibrate", *other, "--scan", "latest", "--node", "http://127.0.0.1:9")
+
+
+def test_calibrate_forgets_nobody_without_a_name() -> None:
+    with pytest.raises(UsageError, match="--forget: which scanner"):
+        run("calibrate", "--forget", " ", "--node", "http://127.0.0.1:9")

@@ -77,7 +77,9 @@ def test_a_damaged_file_stops_no_node_and_is_told_with_every_scan(tmp_path: Path
     axes = Axes(tmp_path)
     axis, trouble = axes.of("SIM-0001", KNOWN.settings)
     assert axis is None and "axes.json cannot be read: calibrate again" in trouble
+    assert axes.damaged.startswith("axes.json cannot be read")
     axes.keep(KNOWN)
+    assert axes.damaged == "" == Axes(tmp_path).damaged
     assert axes.of("SIM-0001", KNOWN.settings) == (FOUND.axis, "") and json.loads(path.read_text())["format"] == 1
     assert path.with_name(SPOILT).read_text() == damage(sound), "other scanners may stand in it"
     for again in (axes, Axes(tmp_path)):

@@ -44,6 +44,23 @@ def test_every_request_is_described_with_its_role(name: str) -> None:
     assert named == {part.split("}")[0] for part in path.split("{")[1:]}
 
 
+def test_every_operation_has_a_name_of_its_own_that_programs_can_be_made_of() -> None:
+    names = {
+        f"{method.upper()} {path}": operation["operationId"]
+        for path, operations in DESCRIPTION["paths"].items()
+        for method, operation in operations.items()
+    }
+    assert names.keys() == set(ENDPOINTS)
+    assert len(set(names.values())) == len(names)
+    assert all(name.isidentifier() for name in names.values())
+    # what programs were made of already: these do not change
+    assert names["GET /"] == "get_page"
+    assert names["GET /v1/scans"] == "get_scans"
+    assert names["GET /v1/scans/{scan}.{format}"] == "get_scans_scan_format"
+    assert names["PATCH /v1/scans/{scan}/sidecar"] == "patch_scans_scan_sidecar"
+    assert names["DELETE /v1/tokens/{name}"] == "delete_tokens_name"
+
+
 def test_every_record_is_there_once_and_referred_to() -> None:
     assert references(DESCRIPTION) == set(DESCRIPTION["components"]["schemas"])
     assert DESCRIPTION["components"]["schemas"]["NewCode"]["properties"]["role"]["default"] == "view"

@@ -325,7 +325,7 @@ def test_another_key_opens_it_from_then_on(folder: Path) -> None:
     with pytest.raises(LibraryError, match="does not open"):
         unseal(folder, KEY, ignore)
     with pytest.raises(LibraryError, match="does not open"):
-        rekey(folder, KEY, KEY)
+        rekey(folder, KEY, KEY + b"!")
     unseal(folder, OTHER, ignore)
 
 

@@ -210,6 +210,14 @@ def test_health_says_when_the_certificate_ends(
     assert said.reasons == reasons
 
 
+def test_health_says_when_the_axes_cannot_be_read(tmp_path: Path, disk: SimpleNamespace) -> None:
+    Library(tmp_path).close()
+    (tmp_path / "axes.json").write_text("{")
+    said = health.examine_health(CaptureStatus("no scanner"), Library(tmp_path), {})
+    why = "axes.json cannot be read, so sweeps are not corrected for an axis: calibrate again"
+    assert (said.status, said.reasons) == ("degraded", (why,))
+
+
 async def test_health_of_a_node_that_stops_is_503(tmp_path: Path, disk: SimpleNamespace) -> None:
     table = Turntable()
     async with served(Library(tmp_path), table) as (node, _):

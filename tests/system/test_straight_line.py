@@ -17,6 +17,7 @@ import pytest
 from client import Model, Update, connect, discover
 from client.errors import RequestRefused
 from foveascan import started
+from node.foveate import REPLY_BYTES
 from protocol import messages as m
 from protocol.errors import LocalWireError
 from protocol.lattice import QUARTERS, Parameters, build_lattice
@@ -185,6 +186,7 @@ async def test_never_a_byte_over_the_limit(head_node: RunningNode, max_bytes: in
                 assert update.bytes_received <= max_bytes
             else:
                 assert update.reason == "byte limit"
+                assert 0 < update.bytes_received <= REPLY_BYTES, "the floor that PROTOCOL names"
 
 
 async def test_the_joint_choice_beats_a_fixed_quality_at_five_budgets(head_node: RunningNode) -> None:  # AT-38

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -21,11 +19,11 @@ from simulators.pace import CATCH_UP_S
 from simulators.usb_descriptors import PACKET_BYTES, UsbIdentity
 from simulators.usb_gadget import UsbGadget
 from simulators.usb_testbed import UsbTestbed
+from tests.permissions import bound_by_permissions
 from tests.system.usb_bed import usb_bed
 
 Bed = UsbTestbed | UsbGadget
 SOON_S = 30.0
-CAPABILITIES_3, DAC_OVERRIDE_AND_SEARCH = 0x20080522, 0b110  # of linux/capability.h
 ADDRESS = UsbAddress.parse(UsbIdentity().address)
 
 
@@ -170,19 +168,6 @@ def test_without_permission_the_udev_rule_is_named(bed: Bed) -> None:
         UsbPort(ADDRESS)
     node.chmod(0o600)
     UsbPort(ADDRESS).close()
-
-
-@contextmanager
-def bound_by_permissions() -> Iterator[None]:
-    """As anybody but root: without the capabilities by which this thread may open everything."""
-    libc, who, had = ctypes.CDLL(None), struct.pack("<Ii", CAPABILITIES_3, 0), ctypes.create_string_buffer(24)
-    assert libc.capget(who, had) == 0
-    effective, *rest = struct.unpack("<6I", had.raw)
-    assert libc.capset(who, struct.pack("<6I", effective & ~DAC_OVERRIDE_AND_SEARCH, *rest)) == 0
-    try:
-        yield
-    finally:
-        assert libc.capset(who, had) == 0
 
 
 def test_unplugging_ends_a_pending_read_at_once(bed: Bed, port: UsbPort) -> None:
