@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -38,13 +38,15 @@ from simulators.tcp_carrier import TcpListener
 from simulators.turntable import Turntable
 from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
 from simulators.usb_double import UsbDouble
-from tests.system.usb_bed import acm_bed, usb_bed
+from tests.system.usb_bed import CONTROLLERS, acm_bed, usb_bed
 
 SPEC = GridSpec(48, 520, 96, 360, 0.01, 0.5)  # two pieces in each column, on serial
 OVERLAP = 64
 REQUEST = SweepRequest(overlap=OVERLAP)
 PLUG_INS_MAX = 8
-USB_CONFIG = ScannerConfig(quiet_s=0.8, payload_max=USB_PAYLOAD_MAX, window_bytes=1 << 20)
+LOOKS_MAX, LOOK_S = 300, 0.1  # for a plug that is out; an emulated machine takes seconds to see it again
+QUIET_S = 2.0 if CONTROLLERS else 0.8  # as a node has it, where a machine may be an emulated one
+USB_CONFIG = ScannerConfig(quiet_s=QUIET_S, payload_max=USB_PAYLOAD_MAX, window_bytes=1 << 20)
 
 Kind = Literal["scan", "interrupted", "refused"]
 
@@ -123,7 +125,7 @@ def pty(bench: Bench) -> Iterator[Line]:
     """A pseudo terminal as fast as the machine allows, served by a thread."""
     path = bench.folder / f"{bench.serial_number}.tty"
     with closing(PtyPort(path, 100_000_000)) as port, _served(bench, port):
-        yield Line(lambda: SerialPort(str(path)), time.monotonic, time.sleep, ScannerConfig(quiet_s=0.8))
+        yield Line(lambda: SerialPort(str(path)), time.monotonic, time.sleep, ScannerConfig(quiet_s=QUIET_S))
 
 
 @contextmanager
@@ -161,7 +163,7 @@ def acm(bench: Bench) -> Iterator[Line]:
     identity = replace(CDC_IDENTITY, serial_number=bench.serial_number)
     with closing(acm_bed(identity, bench.place)) as gadget, _served(bench, gadget):
         address = f"{gadget.name}:{bench.serial_number}"
-        yield Line(lambda: open_port(address), time.monotonic, time.sleep, ScannerConfig(quiet_s=0.8))
+        yield Line(lambda: open_port(address), time.monotonic, time.sleep, ScannerConfig(quiet_s=QUIET_S))
 
 
 @contextmanager
@@ -223,7 +225,6 @@ class Capturing:
                     break
             except PortLost as lost:
                 self._ending.why = str(lost)
-                self._line.wait(0.1)
             except DriverError as error:
                 self._ending.why = str(error)
                 break
@@ -234,7 +235,7 @@ class Capturing:
 
     def _once(self) -> bool:
         """Open the port and sweep, or go on sweeping. Returns whether that was the end of it. Raises DriverError."""
-        with closing(self._line.open_port()) as port:
+        with closing(self._plugged_in()) as port:
             scanner = Scanner(port, self._line.config, clock=self._line.clock)
             info = scanner.hello()
             if self._cut is None:
@@ -248,6 +249,14 @@ class Capturing:
             if self._turn is None:
                 return self._follow(scanner.resume(header, held), info)
             return self._follow(gone_on(scanner, header, self._turn, held, threading.Event(), anew=False), info)
+
+    def _plugged_in(self) -> Port:
+        """The port, once it is there. Raises DriverError."""
+        for _ in range(LOOKS_MAX):
+            with suppress(PortLost):
+                return self._line.open_port()
+            self._line.wait(LOOK_S)
+        return self._line.open_port()
 
     def _follow(self, events: TurnEvents | Generator[SweepEvent, None, None], info: DeviceInfo) -> bool:
         for event in events:

@@ -212,7 +212,8 @@ def test_fast_first_passes_and_several_passes_make_the_same_scan(
 def test_a_fast_first_turn_shows_the_whole_object_early(wire: Carrier, tmp_path: Path) -> None:
     with wire(Bench("", 11, tmp_path)) as line:
         capturing = Capturing(line, tmp_path, SweepRequest(stride=8))
-        capturing.run()
+        ending = capturing.run()
+    assert ending.kind == "scan", ending.why
     width = bumpy().grid.spec.width
     seen = [c.column for c in capturing._held if c.CHANNEL is Channel.RANGE and c.row0 == 0]
     assert seen[: width // 8] == list(range(0, width, 8))
