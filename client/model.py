@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from client.errors import HoldingsDiffer
 from client.export import write_grid
-from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, decode_texture
+from protocol.codec import RangeCodec, TextureCodec, decode_mask, decode_range, decode_ranges, decode_texture
 from protocol.errors import CodecError, LatticeError, RemoteWireError
 from protocol.grid import VOID, FloatArray, Grid, ImageArray, IntArray, StepArray, steps_to_mm
 from protocol.holdings import ChannelHoldings, Holdings, range_rank, texture_rank
@@ -219,9 +219,12 @@ def _selections(strips: Strips) -> list[Selection]:
 def _range_patches(refinement: Refinement, strips: Strips) -> list[StepArray]:
     """What goes into each strip, voids included. Raises CodecError."""
     codec, patches = _codec(RangeCodec, refinement.codec), []
-    payloads, masks = (split_parts(data, len(strips)) for data in (refinement.payload, refinement.mask))
-    for selection, payload, mask in zip(_selections(strips), payloads, masks, strict=True):
-        steps = range_patch(selection, decode_range(payload, codec, selection.sample_shape, refinement.quality))
+    shapes = [selection.sample_shape for selection in _selections(strips)]
+    images = decode_ranges(refinement.payload, codec, shapes, refinement.quality)
+    for selection, image, mask in zip(
+        _selections(strips), images, split_parts(refinement.mask, len(strips)), strict=True
+    ):
+        steps = range_patch(selection, image)
         _apply_mask(mask, steps)
         patches.append(steps)
     return patches

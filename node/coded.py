@@ -25,12 +25,12 @@ from protocol.lattice import (
 )
 from protocol.reconstruct import Selection, range_patch
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
-from protocol.region import Region
+from protocol.region import Cap, Region
 from protocol.rings import ring_strides
 from protocol.strips import Strip, Strips, join_parts, samples_of
 
 FRAME_BYTES = 10  # WebSocket's own, at most
-MERGED_SAMPLES = {Channel.RANGE: 1.5, Channel.TEXTURE: 2.0}
+MERGED_SAMPLES = 2.0
 DENSER_MAX = 2  # along a row than across
 MERGED_QUICKLY = 1.1  # where time counts as well, which more samples take
 
@@ -39,12 +39,12 @@ MERGED_QUICKLY = 1.1  # where time counts as well, which more samples take
 class Part:
     """What one strip of a refinement carries, encoded.
 
-    decoded, void : range only, the samples as a client decodes them and which cells of its patch are void.
-    patch : texture only, the patch that a client makes of it; None where nobody measured it.
+    mask, decoded, void : range only, the samples as a client decodes them and which cells of its patch are void.
+    payload, patch : texture only, the patch is what a client makes of it; None where nobody measured it.
     """
 
     strip: Strip
-    payload: bytes
+    payload: bytes = b""
     mask: bytes = b""
     decoded: StepArray | None = None
     void: BoolArray | None = None
@@ -70,12 +70,14 @@ class Coded:
     """Samples of a lattice, encoded: in one part, on a sphere in one for each strip.
 
     rank, quality, codec : as in protocol.holdings and protocol.refinement; of HTJ2K quality has sixteenths.
+    payload : its values.
     """
 
     parts: tuple[Part, ...]
     rank: int
     quality: float
     codec: int
+    payload: bytes
 
     @property
     def channel(self) -> Channel:
@@ -91,11 +93,6 @@ class Coded:
     def strips(self) -> Strips:
         """What it carries, before it was encoded."""
         return tuple(part.strip for part in self.parts)
-
-    @property
-    def payload(self) -> bytes:
-        """Its values."""
-        return join_parts([part.payload for part in self.parts])
 
     @property
     def mask(self) -> bytes:
@@ -144,16 +141,18 @@ def region_lattice(
     side = RANGE_BLOCK if channel is Channel.RANGE else TEXTURE_BLOCK
     touched = region.touched(side)
     if touched.all():
+        rho = NO_SKIRT if isinstance(region, Cap) else rho
         return Parameters(half_spacing, *region.blocks(side), rho, rho, strides=strides)
     return Parameters(half_spacing, *region.blocks(side), listed=mask_to_runs(touched), strides=strides)
 
 
 @lru_cache(maxsize=64)
 def fewest_strips(shape: ChannelShape, region: Region, quick: bool = False) -> tuple[int, ...]:
-    """The strides of strips that a region's best travels in: few strips, of not many more samples.
+    """The strides of strips that a region's texture best travels in: few strips, of not many more samples.
 
-    Where strips meet a codec pays for both edges, which costs more than samples that lie a little denser. Samples much
-    denser along rows than across would show as spokes round a pole.   quick : spare time rather than bytes.
+    Where strips meet a wavelet pays for both edges, which costs more than samples that lie a little denser. Samples
+    much denser along rows than across would show as spokes round a pole. Range, which travels as one payload, has as
+    many strips as there are.   quick : spare time rather than bytes.
     """
     if not shape.sphere:
         return STRIDES
@@ -161,7 +160,7 @@ def fewest_strips(shape: ChannelShape, region: Region, quick: bool = False) -> t
     own = ring_strides(shape.width, shape.height, shape.block)[region.blocks(shape.block)[1] :][: wide.size]
     starts = [0, *(np.flatnonzero(own[1:] != own[:-1]) + 1).tolist(), wide.size]
     rows = [_Rows(stop - start, int(wide[start:stop].max()), int(own[start])) for start, stop in pairwise(starts)]
-    most = (MERGED_QUICKLY if quick else MERGED_SAMPLES[shape.channel]) * _strips_of(rows, STRIDES)[1]
+    most = (MERGED_QUICKLY if quick else MERGED_SAMPLES) * _strips_of(rows, STRIDES)[1]
     offers = [(*_strips_of(rows, strides), strides) for strides in STRIDE_SETS]
     return min((count, samples, strides) for count, samples, strides in offers if samples <= most)[2]
 

@@ -118,7 +118,7 @@ def _code_listed(
     scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, apart: BoolArray, quick: bool = False
 ) -> Coded | None:
     """Encode the region's blocks but for those apart."""
-    parameters = range_lattice(state, region, wanted)
+    parameters = range_lattice(region, wanted)
     if apart.any():
         parameters = replace(parameters, listed=mask_to_runs(~apart))
     return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick)

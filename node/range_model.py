@@ -1,7 +1,6 @@
 """What range interpolated between every second, fourth and eighth sample misses, cell by cell: measured once a scan.
 
-So a look knows before any trial which spacing will do at its place, and about which quantum. On a sphere the rows near
-a pole are measured several times, as their samples may stand as far apart as their own do, or as those of other rows.
+So a look knows before any trial which spacing will do at its place, and about which quantum.
 """
 
 from __future__ import annotations
@@ -12,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.grid import RANGE_BLOCK, VOID, FloatArray, GridSpec, IntArray, StepArray
-from protocol.lattice import STRIDES
 from protocol.region import Region
-from protocol.rings import limited_strides, ring_strides
+from protocol.rings import ring_strides
 
 SPACINGS = (2, 4, 8)
 PERCENTILE = 99
@@ -41,8 +39,7 @@ class _Rows:
 
 
 class RangeModel:
-    """Errors of range that is interpolated and not quantised. Memory: a byte for each cell and spacing, a third more
-    on a sphere.
+    """Errors of range that is interpolated and not quantised. Memory: a byte for each own sample and spacing.
 
     range_steps, filled : as of node.library.Scan.
     """
@@ -52,8 +49,8 @@ class RangeModel:
         self._strides: dict[int, IntArray] = {}
         for p in (p for p in SPACINGS if not spec.width % p):
             self._strides[p] = strides = _strides(spec, p)
-            for stride in (stride for stride in STRIDES if stride <= strides.max()):
-                rows = np.flatnonzero(strides >= stride)
+            for stride in np.unique(strides).tolist():
+                rows = np.flatnonzero(strides == stride)
                 self._known[p, stride] = _Rows(rows, _error_codes(range_steps, filled, rows, p, stride))
 
     @property
@@ -61,15 +58,15 @@ class RangeModel:
         """Whether it can say anything of its scan."""
         return bool(self._known)
 
-    def error(self, region: Region, p: int, strides: tuple[int, ...] = STRIDES) -> float:
+    def error(self, region: Region, p: int) -> float:
         """99th percentile of the error over a region's measured cells, 5% too high at most; infinite where unknown.
 
-        strides : of the strips that a sphere's range travels in. Cells are weighed by their area.
+        Cells are weighed by their area.
         """
         if p == 1 or p not in self._strides:
             return 0.0 if p == 1 else np.inf
         rows = np.arange(region.top, region.top + region.height)
-        sent = limited_strides(self._strides[p][rows], strides)
+        sent = self._strides[p][rows]
         counts = np.zeros(UNMEASURED + 1)
         for stride in np.unique(sent).tolist():
             known, wanted = self._known[p, stride], rows[sent == stride]

@@ -11,7 +11,7 @@ import math
 
 import msgspec
 
-from node.coded import Coded, fewest_strips
+from node.coded import Coded
 from node.library import Scan
 from node.quality import Encodes
 from node.range_bitmaps import reach_range
@@ -162,8 +162,7 @@ class RangeSearch:
         if p not in self._errors:
             shape = self._state.shapes[Channel.RANGE]
             finer = p * p < 1 << shape.coarse_level  # than the first view: else nobody would adopt it
-            strides = fewest_strips(shape, self._region)
-            self._errors[p] = self._model.error(self._region, p, strides) if finer else math.inf
+            self._errors[p] = self._model.error(self._region, p) if finer else math.inf
         return self._errors[p]
 
     def _trial(self, p: int) -> Trial | None:

@@ -12,20 +12,20 @@ from typing import Literal
 
 import numpy as np
 
-from node.coded import Coded, Part, fewest_strips, framed, message_overhead, own_inside, region_lattice, rho_of
+from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of
 from node.library import Scan
 from node.range_model import percentile_of
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
-from protocol.codec_lift import Survey, encode_and_decode
+from protocol.codec_lift import Survey, encode_surveyed, expected_bytes
 from protocol.grid import RANGE_BLOCK, VOID, FloatArray, IntArray
 from protocol.holdings import COARSE_RANK, ChannelHoldings, range_rank
 from protocol.lattice import NO_SKIRT, Channel, Lattice, Parameters
 from protocol.messages import RangeParameters
 from protocol.reconstruct import Selection, content_hashes, cut, range_patch
 from protocol.region import Region
-from protocol.strips import LENGTH, Strip, Strips, build_strips, join_parts, select_strips
+from protocol.strips import Strips, build_strips, join_parts, select_strips
 
 SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
 QUANTUM_MAX = 4096
@@ -77,8 +77,7 @@ def trial_of(scan: Scan, state: ClientState, region: Region, p: int) -> Trial | 
     if scan.spec.width % p:
         return None
     fresh = ChannelHoldings.coarse(state.shapes[Channel.RANGE])
-    strides = fewest_strips(fresh.shape, region)
-    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p, NO_SKIRT, strides))
+    lattices = build_strips(fresh.shape, region_lattice(region, Channel.RANGE, 2 * p, NO_SKIRT))
     strips = select_strips(lattices, fresh, range_rank(1))
     return Trial(scan, strips, region) if strips else None
 
@@ -92,7 +91,7 @@ def code_range(
     Where a block that would become finer is held at better values, the whole refinement takes those (F-09c).
     Raises LatticeError for a spacing that does not fit the scan.
     """
-    parameters = range_lattice(state, region, wanted, merged=not quick)
+    parameters = range_lattice(region, wanted)
     return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick)
 
 
@@ -103,20 +102,22 @@ def code_range_lattice(
     strips, quantum = select_range_lattice(state, parameters, quantum)
     if not strips:
         return None
-    parts = tuple(_code_strip(scan, strip, quantum, quick) for strip in strips)
-    return Coded(parts, range_rank(quantum), quantum, RangeCodec.LIFT)
+    images = _surveyed(scan, strips, quantum)
+    voids = [void_cells(scan, strip.selection) for strip in strips]
+    parts = tuple(
+        Part(strip, mask=encode_mask(void), decoded=image.decoded, void=void)
+        for strip, image, void in zip(strips, images, voids, strict=True)
+    )
+    return Coded(parts, range_rank(quantum), quantum, RangeCodec.LIFT, encode_surveyed(images, quick=quick))
 
 
-def _code_strip(scan: Scan, strip: Strip, quantum: int, quick: bool) -> Part:
-    samples, seen = range_samples(scan, strip.selection)
-    payload, decoded = encode_and_decode(samples, quantum, seen, quick=quick)
-    void = void_cells(scan, strip.selection)
-    return Part(strip, payload, encode_mask(void), decoded, void)
+def _surveyed(scan: Scan, strips: Strips, quantum: int) -> list[Survey]:
+    return [Survey(samples, quantum, seen) for samples, seen in (range_samples(scan, s.selection) for s in strips)]
 
 
 def select_range(state: ClientState, region: Region, wanted: RangeParameters) -> tuple[Strips, int]:
     """What code_range would carry, if anything, and its quantum."""
-    return select_range_lattice(state, range_lattice(state, region, wanted), wanted.quantum)
+    return select_range_lattice(state, range_lattice(region, wanted), wanted.quantum)
 
 
 def select_range_lattice(state: ClientState, parameters: Parameters, quantum: int) -> tuple[Strips, int]:
@@ -132,20 +133,13 @@ def expected_range_bytes(scan: Scan, strips: Strips, quantum: int) -> float:
     if not strips:
         return 0.0
     masks = join_parts([encode_mask(void_cells(scan, strip.selection)) for strip in strips])
-    payload_bytes = sum(_surveyed(scan, strip.selection, quantum) for strip in strips)
-    overhead = message_overhead(strips[0].selection.lattice.parameters) + LENGTH.size * (len(strips) - 1)
-    return framed(overhead + len(masks) + round(payload_bytes))
+    payload_bytes = expected_bytes(_surveyed(scan, strips, quantum))
+    return framed(message_overhead(strips[0].selection.lattice.parameters) + len(masks) + round(payload_bytes))
 
 
-def _surveyed(scan: Scan, selection: Selection, quantum: int) -> float:
-    samples, seen = range_samples(scan, selection)
-    return Survey(samples, quantum, seen).expected_bytes
-
-
-def range_lattice(state: ClientState, region: Region, wanted: RangeParameters, *, merged: bool = True) -> Parameters:
-    """The lattice of a region's blocks; merged : of a sphere in as few strips as saves bytes, else as saves time."""
-    strides = fewest_strips(state.shapes[Channel.RANGE], region, quick=not merged)
-    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho_of(wanted.s), strides)
+def range_lattice(region: Region, wanted: RangeParameters) -> Parameters:
+    """The lattice of a region's blocks."""
+    return region_lattice(region, Channel.RANGE, 2 * wanted.p, rho_of(wanted.s))
 
 
 def note_range(scan: Scan, state: ClientState, coded: Coded, target_steps: float) -> None:
@@ -191,7 +185,7 @@ class Trial:
 
     def expected_bytes(self, quantum: int) -> float:
         """About how many bytes the refinement takes."""
-        return sum(part.survey(quantum).expected_bytes for part in self._parts)
+        return expected_bytes([part.survey(quantum) for part in self._parts])
 
 
 class _TrialPart:

@@ -22,7 +22,7 @@ from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
-from protocol.strips import Strips, build_strips, select_strips
+from protocol.strips import Strips, build_strips, join_parts, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
@@ -88,9 +88,9 @@ def select_texture_lattice(state: ClientState, parameters: Parameters, quality: 
 def code_texture_strips(scan: Scan, strips: Strips, quality: float, codec: TextureCodec, *, quick: bool) -> Coded:
     """Encode what was selected."""
     texels = (texture_samples(scan, strip.selection) for strip in strips)
-    payloads = (encode_texture(image, codec, quality, quick=quick) for image in texels)
+    payloads = [encode_texture(image, codec, quality, quick=quick) for image in texels]
     parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
-    return Coded(parts, texture_rank(int(quality)), quality, codec)
+    return Coded(parts, texture_rank(int(quality)), quality, codec, join_parts(payloads))
 
 
 def select_texture(state: ClientState, region: Region, wanted: TextureParameters) -> tuple[Strips, int]:

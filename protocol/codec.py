@@ -10,6 +10,7 @@ JPEG of equal quality is one of equal PSNR, by the table JPEG_Q. 255 is lossless
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
@@ -101,6 +102,20 @@ def decode_range(payload: bytes, codec: RangeCodec, shape: tuple[int, int], quan
     return dequantise(np.frombuffer(payload, "<u2").astype(np.uint16).reshape(shape), quantum)
 
 
+def decode_ranges(
+    payload: bytes, codec: RangeCodec, shapes: Sequence[tuple[int, int]], quantum: int = 1
+) -> list[StepArray]:
+    """Steps, as of decode_range, of each of several images in one payload, which is LIFT. Raises CodecError."""
+    if len(shapes) == 1:
+        return [decode_range(payload, codec, shapes[0], quantum)]
+    if codec != RangeCodec.LIFT:
+        raise CodecError("range of several images travels as LIFT alone")
+    for shape in shapes:
+        _check_shape(shape)
+    _check_length(payload, sum(height * width for height, width in shapes), 2)
+    return codec_lift.decode_all(payload, shapes, quantum)
+
+
 def encode_mask(mask: BoolArray) -> bytes:
     """Payload of an (h, w) bool mask, true where void; empty when nothing is. Raises CodecError for another array."""
     _check_array(mask, np.bool_, 1)
@@ -129,9 +144,13 @@ def _check_array(array: np.ndarray, dtype: type[np.generic], channels: int) -> N
 
 def _check_payload(payload: bytes, shape: tuple[int, int], sample_bytes: int) -> None:
     _check_shape(shape)
-    limit = 4096 + 2 * sample_bytes * shape[0] * shape[1]
-    if len(payload) > limit:
-        raise CodecError(f"payload of {len(payload)} bytes for {shape} samples; {limit} at most")
+    _check_length(payload, shape[0] * shape[1], sample_bytes)
+
+
+def _check_length(payload: bytes, samples: int, sample_bytes: int) -> None:
+    limit = 4096 + 2 * sample_bytes * samples
+    if samples > SAMPLES_MAX or len(payload) > limit:
+        raise CodecError(f"payload of {len(payload)} bytes for {samples} samples; {limit} at most")
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:

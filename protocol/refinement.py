@@ -25,7 +25,8 @@ PARAMETERS = struct.Struct("<BHHHHII")
 PARAMETERS_MAX = 4096
 MASK_MAX = 8 << 20
 PAYLOAD_MAX = 256 << 20
-VARINT_MAX = 5
+HALF = 15  # of a byte, at most
+HALVES_MAX = 8  # of a step, behind the first
 SPACING_BITS = 5  # of the byte that half spacing and the largest stride share
 AnyParameters = Parameters | ClassicParameters | SphereParameters
 
@@ -114,7 +115,7 @@ def _unpacked(generator: Generator, data: bytes) -> AnyParameters | None:
 
 @lru_cache(maxsize=16)
 def pack_parameters(p: Parameters) -> bytes:
-    """Lattice parameters as they travel: 17 bytes, then the listed runs as varints when there are any.
+    """Lattice parameters as they travel: 17 bytes, then the listed runs when there are any.
 
     Raises LocalWireError when they do not fit.
     """
@@ -124,14 +125,14 @@ def pack_parameters(p: Parameters) -> bytes:
         head = PARAMETERS.pack(spacing_byte(p), p.block_x, p.block_y, p.blocks_wide, p.blocks_high, p.rho_x, p.rho_y)
     except struct.error as error:
         raise LocalWireError(f"lattice parameters out of bounds: {error}") from None
-    return head + b"".join(_varint(run) for run in p.listed or ())
+    return head + _pack_runs(p.listed or ())
 
 
 def unpack_parameters(data: bytes) -> Parameters:
     """Inverse of pack_parameters. Raises RemoteWireError when the bytes are not whole."""
     if len(data) < PARAMETERS.size:
         raise RemoteWireError("lattice parameters are cut short")
-    runs = _varints(data[PARAMETERS.size :])
+    runs = _unpack_runs(data[PARAMETERS.size :])
     spacing, x, y, wide, high, rho_x, rho_y = PARAMETERS.unpack_from(data)
     half_spacing, strides = from_spacing_byte(spacing)
     return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, runs or None, strides)
@@ -177,27 +178,45 @@ def _running(start: int, sizes: tuple[int, ...]) -> list[int]:
     return ends
 
 
-def _varint(value: int) -> bytes:
-    if not 0 <= value < 1 << 7 * VARINT_MAX:
-        raise LocalWireError(f"run length {value} out of bounds")
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
+def _pack_runs(runs: tuple[int, ...]) -> bytes:
+    """Run lengths in half bytes, as steps from the run before the last: rows of a round window differ by little.
+
+    A step is 2 d or, below 0, -2 d - 1: one half byte up to 14, else 15 and what is beyond in halves of three bits, low
+    first, their fourth bit where more follow. A last half byte that is left over is 15.
+    """
+    halves: list[int] = []
+    for run, before in zip(runs, (0, 0, *runs), strict=False):
+        step = run - before
+        beyond = (2 * step if step >= 0 else -2 * step - 1) - HALF
+        if not (0 <= run and beyond < 1 << 3 * HALVES_MAX):
+            raise LocalWireError(f"run length {run} out of bounds")
+        if beyond < 0:
+            halves.append(beyond + HALF)
+            continue
+        halves.append(HALF)
+        while beyond > 7:
+            halves.append(beyond & 7 | 8)
+            beyond >>= 3
+        halves.append(beyond)
+    if len(halves) % 2:
+        halves.append(HALF)
+    return bytes(low | high << 4 for low, high in zip(halves[::2], halves[1::2], strict=True))
 
 
-def _varints(data: bytes) -> tuple[int, ...]:
-    values, value, shift = [], 0, 0
-    for byte in data:
-        value |= (byte & 0x7F) << shift
-        shift += 7
-        if shift > 7 * VARINT_MAX:
-            raise RemoteWireError("run length out of bounds")
-        if not byte & 0x80:
-            values.append(value)
-            value = shift = 0
-    if shift:
-        raise RemoteWireError("run lengths are cut short")
-    return tuple(values)
+def _unpack_runs(data: bytes) -> tuple[int, ...]:
+    """Inverse of _pack_runs. Raises RemoteWireError."""
+    halves = [half for byte in data for half in (byte & 15, byte >> 4)]
+    runs, at = [0, 0], 0
+    while at < len(halves):
+        step, shift, at = halves[at], 0, at + 1
+        if step == HALF and at == len(halves):
+            break
+        more = step == HALF
+        while more:
+            if at == len(halves) or shift == 3 * HALVES_MAX:
+                raise RemoteWireError("run lengths are cut short or out of bounds")
+            step, more, shift, at = step + ((halves[at] & 7) << shift), halves[at] > 7, shift + 3, at + 1
+        runs.append(runs[-2] + (-(step + 1) // 2 if step % 2 else step // 2))
+        if runs[-1] < 0:
+            raise RemoteWireError("run length below nought")
+    return tuple(runs[2:])

@@ -118,23 +118,22 @@ def _range(
 ) -> dict[str, Any]:
     held, rank = holdings.channels[Channel.RANGE], range_rank(quantum)
     strips = select_strips(build_strips(RANGE, parameters), held, rank)
-    payloads, masks = [], []
+    images, masks = [], []
     for selection in (strip.selection for strip in strips):
         rows, columns = _places(selection)
         samples = np.maximum(scan[np.ix_(rows, columns)], 1)
-        payload, decoded = codec_lift.encode_and_decode(samples, quantum)
+        images.append(codec_lift.Survey(samples, quantum))
         void = (np.asarray(cut(scan, selection)) == VOID) & selection.seen_cells()
-        patch = range_patch(selection, decoded)
+        patch = range_patch(selection, images[-1].decoded)
         patch[void] = VOID
         paste(dense, patch, selection)
         holdings.add_content(selection.adopted_blocks(), content_hashes(patch, selection))
-        payloads.append(payload)
         masks.append(encode_mask(void))
     for strip in strips:
         held.adopt(strip.selection.lattice, strip.adopted, rank)
     refinement = Refinement(
-        Generator.FOVEA, Channel.RANGE, 1, seq, 1, RangeCodec.LIFT, quantum, samples_of(strips), join_parts(payloads),
-        join_parts(masks), parameters,
+        Generator.FOVEA, Channel.RANGE, 1, seq, 1, RangeCodec.LIFT, quantum, samples_of(strips),
+        codec_lift.encode_surveyed(images) if images else b"", join_parts(masks), parameters,
     )  # fmt: skip
     return {
         "refinement": refinement.to_bytes().hex() if strips else None,

@@ -80,7 +80,25 @@ def test_lift_surveys_what_it_decodes_to() -> None:
     surveyed = codec_lift.Survey(values, 300, care)
     payload = codec_lift.encode(values, 300, care)
     np.testing.assert_array_equal(surveyed.decoded, codec_lift.decode(payload, (33, 40), 300))
-    assert 0.5 < surveyed.expected_bytes / len(payload) < 2
+    assert 0.5 < codec_lift.expected_bytes([surveyed]) / len(payload) < 2
+
+
+def test_lift_carries_several_images_in_fewer_bytes_than_one_each() -> None:
+    shapes = [(33, 40), (1, 7), (56, 180)]
+    images = [codec_lift.Survey(ranges(shape), 300) for shape in shapes]
+    payload = codec_lift.encode_surveyed(images)
+    decoded = codec.decode_ranges(payload, RangeCodec.LIFT, shapes, 300)
+    for image, steps in zip(images, decoded, strict=True):
+        np.testing.assert_array_equal(steps, image.decoded)
+    assert len(payload) < sum(len(codec_lift.encode_surveyed([image])) for image in images)
+    with pytest.raises(CodecError, match="LIFT alone"):
+        codec.decode_ranges(payload, RangeCodec.RAW, shapes, 300)
+    with pytest.raises(CodecError):
+        codec.decode_ranges(payload, RangeCodec.LIFT, shapes[:2], 300)
+    with pytest.raises(CodecError):
+        codec.decode_ranges(payload, RangeCodec.LIFT, [*shapes, (4, 4)], 300)
+    with pytest.raises(CodecError, match="shape"):
+        codec.decode_ranges(payload, RangeCodec.LIFT, [(33, 40), (0, 7)], 300)
 
 
 @settings(max_examples=60, deadline=None)

@@ -2,13 +2,14 @@ import struct
 import zlib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.classic import ClassicParameters
 from protocol.errors import LocalWireError, RemoteWireError
-from protocol.lattice import NO_SKIRT, STRIDE_SETS, Channel, Parameters
+from protocol.lattice import NO_SKIRT, STRIDE_SETS, Channel, Parameters, mask_to_runs
 from protocol.refinement import (
     CRC,
     HEADER,
@@ -22,7 +23,7 @@ from protocol.refinement import (
 )
 
 U16, U32 = st.integers(0, 0xFFFF), st.integers(0, 0xFFFFFFFF)
-RUNS = st.none() | st.lists(st.integers(0, 2**35 - 1), min_size=1, max_size=20).map(tuple)
+RUNS = st.none() | st.lists(st.integers(0, 2**22), min_size=1, max_size=20).map(tuple)
 PARAMETERS = st.builds(
     Parameters, st.integers(0, 31), U16, U16, U16, U16, U32, U32, RUNS, st.sampled_from(STRIDE_SETS)
 )
@@ -84,7 +85,7 @@ def test_a_classic_fovea_has_parameters_of_its_own() -> None:
 
 
 def test_the_layout_is_the_documented_one() -> None:
-    parameters = struct.pack("<BHHHHII", 4, 44, 5, 2, 2, 1, 2) + bytes([1, 3])
+    parameters = struct.pack("<BHHHHII", 4, 44, 5, 2, 2, 1, 2) + bytes([0x62])
     header = struct.pack("<HBBBBBBHHIIIHHII", 0x5246, 1, 1, 0, 1, 1, 0, 3, 2, 7, 12, 289, len(parameters), 0, 4, 7)
     body = header + parameters + b"mask" + b"payload"
     assert FOVEA.to_bytes() == body + struct.pack("<I", zlib.crc32(body))
@@ -142,10 +143,18 @@ def test_no_skirt_travels_as_nought() -> None:
     assert pack_parameters(Parameters(2, 0, 0, 1, 1))[-8:] == bytes(8) and NO_SKIRT == 0
 
 
-@pytest.mark.parametrize("tail", [b"\x80", b"\x80\x80\x80\x80\x80\x01", b"\xff" * 6 + b"\x00", b"\x01\x80"])
+@pytest.mark.parametrize("tail", [b"\x01", b"\x12", b"\xff", b"\xff" * 5 + b"\x00", b"\x02\x0f\xff"])
 def test_run_lengths_out_of_bounds_are_refused(tail: bytes) -> None:
     with pytest.raises(RemoteWireError):
         unpack_parameters(pack_parameters(Parameters(2, 0, 0, 1, 1)) + tail)
+
+
+def test_runs_of_a_round_window_take_about_half_a_byte_each() -> None:
+    data = pack_parameters(Parameters(2, 0, 0, 4, 19, listed=(2, 3, 2, 5, 60, 4)))
+    assert data[17:] == bytes.fromhex("64 40 df 1c f1")  # PROTOCOL.md, "Refinement"
+    row, column = np.mgrid[-18:19, -18:19]
+    runs = mask_to_runs(np.hypot(row, column) < 18.4)
+    assert len(pack_parameters(Parameters(2, 0, 0, 37, 37, listed=runs))) - 17 < 0.65 * len(runs)
 
 
 @pytest.mark.parametrize("size", range(17))
@@ -178,6 +187,6 @@ def test_parameters_that_do_not_fit_are_refused(parameters: Parameters) -> None:
 def test_refinements_that_do_not_fit_are_refused(field: dict[str, int]) -> None:
     with pytest.raises(LocalWireError):
         replace(FOVEA, **field).to_bytes()  # type: ignore[arg-type]
-    listed = tuple([1] * PARAMETERS_MAX)
+    listed = tuple([1] * 2 * PARAMETERS_MAX)
     with pytest.raises(LocalWireError):
         replace(FOVEA, parameters=Parameters(2, 0, 0, 1, 1, listed=listed)).to_bytes()

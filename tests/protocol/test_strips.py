@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.codec_lift import decode, encode_and_decode
+from protocol.codec_lift import Survey, decode_all, encode_surveyed
 from protocol.errors import CodecError, LatticeError
 from protocol.grid import VOID, BoolArray, StepArray
 from protocol.holdings import ChannelHoldings, range_rank, texture_rank
@@ -57,10 +57,12 @@ def samples_at(steps: StepArray, selection: Selection) -> StepArray:
 def refine(dense: StepArray, held: ChannelHoldings, scan: StepArray, parameters: Parameters, quantum: int = 1) -> int:
     """Apply one refinement to a dense model and its holdings, as both ends do. Returns the samples it took."""
     strips = select_strips(build_strips(held.shape, parameters), held, range_rank(quantum))
-    for strip in strips:
+    images = [Survey(samples_at(scan, strip.selection), quantum) for strip in strips]
+    shapes = [strip.selection.sample_shape for strip in strips]
+    every = decode_all(encode_surveyed(images), shapes, quantum) if images else []
+    for strip, image, decoded in zip(strips, images, every, strict=True):
         selection = strip.selection
-        payload, decoded = encode_and_decode(samples_at(scan, selection), quantum)
-        np.testing.assert_array_equal(decode(payload, selection.sample_shape, quantum), decoded)
+        np.testing.assert_array_equal(image.decoded, decoded)
         patch = range_patch(selection, decoded)
         patch[(np.asarray(cut(scan, selection)) == VOID) & selection.seen_cells()] = VOID
         paste(dense, patch, selection)

@@ -3,6 +3,7 @@
 import { RemoteWireError } from './errors.ts';
 import { jpegQ, restoreJpeg } from './codec_jpeg.ts';
 import { decodeLift } from './codec_lift.ts';
+import type { Shape } from './codec_lift.ts';
 import { decodeMask } from './codec_mask.ts';
 import { decodeColours } from './codec_colours.ts';
 import { LOSSLESS } from './codec_htj2k.ts';
@@ -23,12 +24,26 @@ export type JpegDecoder = (file: Uint8Array, width: number, height: number) => P
 export class Codecs {
   constructor(private readonly htj2k: () => Promise<Htj2kDecoder>, private readonly jpeg: JpegDecoder) {}
 
+  /** Steps 1..65535, row by row, of each image in a payload; of several it is LIFT. Throws RemoteWireError. */
+  async ranges(payload: Uint8Array, codec: number, shapes: readonly Shape[], quantum: number): Promise<Uint16Array[]> {
+    const samples = shapes.map(({ height, width }) => checkShape(height, width)).reduce((sum, one) => sum + one);
+    checkLength(payload, samples, 2);
+    if (codec === LIFT) return decodeLift(payload, shapes, quantum);
+    if (shapes.length > 1) throw new RemoteWireError('range of several images travels as LIFT alone');
+    const { height, width } = shapes[0]!;
+    return [await this.values(payload, codec, height, width, quantum)];
+  }
+
   /** Steps 1..65535, row by row. Throws RemoteWireError. */
   async range(
     payload: Uint8Array, codec: number, height: number, width: number, quantum: number,
   ): Promise<Uint16Array> {
-    checkSize(payload, height, width, 2);
-    if (codec === LIFT) return decodeLift(payload, height, width, quantum);
+    return (await this.ranges(payload, codec, [{ height, width }], quantum))[0]!;
+  }
+
+  private async values(
+    payload: Uint8Array, codec: number, height: number, width: number, quantum: number,
+  ): Promise<Uint16Array> {
     if (codec === RAW && payload.length !== 2 * height * width) throw new RemoteWireError('raw range of another size');
     if (codec !== RAW && codec !== HTJ2K) throw new RemoteWireError(`no range codec ${codec}`);
     const shape = { height, width, components: 1 } as const;
@@ -61,9 +76,20 @@ export class Codecs {
 }
 
 function checkSize(payload: Uint8Array, height: number, width: number, sampleBytes: number): void {
+  checkLength(payload, checkShape(height, width), sampleBytes);
+}
+
+/** How many samples a shape has. */
+function checkShape(height: number, width: number): number {
   const fits = height >= 1 && width >= 1 && Math.max(height, width) <= SIDE_MAX && height * width <= SAMPLES_MAX;
   if (!fits) throw new RemoteWireError(`payload of ${height} x ${width} samples`);
-  if (payload.length > 4096 + 2 * sampleBytes * height * width) throw new RemoteWireError('payload is too long');
+  return height * width;
+}
+
+function checkLength(payload: Uint8Array, samples: number, sampleBytes: number): void {
+  if (samples > SAMPLES_MAX || payload.length > 4096 + 2 * sampleBytes * samples) {
+    throw new RemoteWireError('payload is too long');
+  }
 }
 
 function toRgba(rgb: Uint8Array): Uint8Array {

@@ -3,21 +3,26 @@
 import { RemoteWireError } from './errors.ts';
 import { inflate } from './inflate.ts';
 
+/** Rows and columns of an image. */
+export interface Shape {
+  height: number;
+  width: number;
+}
+
 const STEPS_MAX = 65535;
 const ESCAPE = 3;
 const BYTE = 255;
 const WORD_MAX = 4 * STEPS_MAX;
 
-/** (height x width) steps of a payload, within 1..65535. Throws RemoteWireError. */
-export async function decodeLift(
-  payload: Uint8Array, height: number, width: number, quantum: number,
-): Promise<Uint16Array> {
-  const count = height * width;
+/** (height x width) steps, within 1..65535, of each image in a payload. Throws RemoteWireError. */
+export async function decodeLift(payload: Uint8Array, shapes: readonly Shape[], quantum: number): Promise<Uint16Array[]> {
+  const count = shapes.reduce((sum, { height, width }) => sum + height * width, 0);
   const misses = unpack(await inflate(payload, 6 * count + 8), count);
-  const values = synthesise(misses, height, width, quantum);
-  const steps = new Uint16Array(count);
-  for (let index = 0; index < count; index++) steps[index] = Math.min(Math.max(values[index]!, 1), STEPS_MAX);
-  return steps;
+  let at = 0;
+  return shapes.map(({ height, width }) => {
+    const values = synthesise(misses.subarray(at, at += height * width), height, width, quantum);
+    return Uint16Array.from(values, (value) => Math.min(Math.max(value, 1), STEPS_MAX));
+  });
 }
 
 /** The misses as they travel: two bits each, 3 for "see the escapes"; a byte each, 255 for "see the words". */

@@ -2,7 +2,6 @@
 
 import { RemoteWireError } from './errors.ts';
 import { inflate } from './inflate.ts';
-import { parseVarints } from './refinement.ts';
 
 /** A byte a cell, 1 where void; row by row. Throws RemoteWireError. */
 export async function decodeMask(payload: Uint8Array, height: number, width: number): Promise<Uint8Array> {
@@ -60,3 +59,19 @@ function fillRow(mask: Uint8Array, start: number, width: number, edges: number[]
 }
 
 const signed = (number: number): number => (number & 1 ? -((number + 1) >> 1) : number >> 1);
+
+/** Numbers of seven bits a byte, low first, each of at most `most` bytes. Throws RemoteWireError. */
+function parseVarints(data: Uint8Array, most: number): number[] {
+  const values: number[] = [];
+  let [value, bytes] = [0, 0];
+  for (const byte of data) {
+    value += (byte & 0x7f) * 2 ** (7 * bytes++);
+    if (bytes > most) throw new RemoteWireError('a number out of bounds');
+    if (byte < 0x80) {
+      values.push(value);
+      [value, bytes] = [0, 0];
+    }
+  }
+  if (bytes) throw new RemoteWireError('numbers are cut short');
+  return values;
+}

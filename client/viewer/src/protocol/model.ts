@@ -183,12 +183,13 @@ export class Model {
 
 /** What goes into each strip, voids included. */
 async function rangePatches({ payload, mask, codec, quality }: Refinement, strips: Chosen[], codecs: Codecs): Promise<Uint16Array[]> {
-  const [payloads, masks] = [payload, mask].map((data) => splitParts(data, strips.length));
+  const masks = splitParts(mask, strips.length);
+  const shapes = strips.map(({ selection: { x, y } }) => ({ height: y.sample.length, width: x.sample.length }));
+  const images = await codecs.ranges(payload, codec, shapes, quality);
   return Promise.all(strips.map(async ({ selection }, index) => {
     const { x, y } = selection;
-    const samples = await codecs.range(payloads![index]!, codec, y.sample.length, x.sample.length, quality);
-    const patch = rangePatch(selection, samples);
-    await applyMask(patch, masks![index]!, codecs, y.low.length, x.low.length);
+    const patch = rangePatch(selection, images[index]!);
+    await applyMask(patch, masks[index]!, codecs, y.low.length, x.low.length);
     return patch;
   }));
 }

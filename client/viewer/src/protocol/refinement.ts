@@ -13,6 +13,8 @@ const PARAMETERS_BYTES = 17;
 const PARAMETERS_MAX = 4096;
 const MASK_MAX = 8 << 20;
 const PAYLOAD_MAX = 256 << 20;
+const HALF = 15;
+const HALVES_MAX = 8;
 
 export const COARSE = 0;
 export const FOVEA = 1;
@@ -72,22 +74,25 @@ export function parseParameters(data: Uint8Array): Parameters {
   return {
     halfSpacing: view.getUint8(0) & 31, ...allowed(view.getUint8(0) >> 5), blockX: u16(1), blockY: u16(3), blocksWide: u16(5), blocksHigh: u16(7),
     rhoX: view.getUint32(9, true), rhoY: view.getUint32(13, true),
-    listed: data.length > PARAMETERS_BYTES ? parseVarints(data.subarray(PARAMETERS_BYTES), 5) : null,
+    listed: data.length > PARAMETERS_BYTES ? parseRuns(data.subarray(PARAMETERS_BYTES)) : null,
   };
 }
 
-/** Numbers of seven bits a byte, low first, each of at most `most` bytes. Throws RemoteWireError. */
-export function parseVarints(data: Uint8Array, most: number): number[] {
-  const values: number[] = [];
-  let [value, bytes] = [0, 0];
-  for (const byte of data) {
-    value += (byte & 0x7f) * 2 ** (7 * bytes++);
-    if (bytes > most) throw new RemoteWireError('a number out of bounds');
-    if (byte < 0x80) {
-      values.push(value);
-      [value, bytes] = [0, 0];
+/** Run lengths of listed blocks, from half bytes (PROTOCOL.md, "Refinement"). Throws RemoteWireError. */
+function parseRuns(data: Uint8Array): number[] {
+  const halves = Array.from(data).flatMap((byte) => [byte & 15, byte >> 4]);
+  const runs = [0, 0];
+  for (let at = 0; at < halves.length;) {
+    let step = halves[at++]!;
+    if (step === HALF && at === halves.length) break;
+    for (let more = step === HALF, scale = 1; more; scale *= 8) {
+      if (at === halves.length || scale === 8 ** HALVES_MAX) throw new RemoteWireError('run lengths are cut short or out of bounds');
+      step += (halves[at]! & 7) * scale;
+      more = halves[at++]! > 7;
     }
+    const run = runs.at(-2)! + (step % 2 ? -(step + 1) / 2 : step / 2);
+    if (run < 0) throw new RemoteWireError('run length below nought');
+    runs.push(run);
   }
-  if (bytes) throw new RemoteWireError('numbers are cut short');
-  return values;
+  return runs.slice(2);
 }
