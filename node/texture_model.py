@@ -288,16 +288,19 @@ def _survey(measured: _Measured, texture: ImageArray, unwanted: Callable[[], boo
 def _constant_bytes(
     measured: _Measured, texture: ImageArray, taken: dict[tuple[int, int], FloatArray], side: int
 ) -> FloatArray:
-    """What four tiles take more than the same texels in one image, for each image saved. (one value per quality)"""
+    """What tiles take more than the same texels in one image, for each image saved. (one value per quality)
+
+    Four tiles each time, two where rows are too few for more.
+    """
     saved = []
     for index, (top, left) in enumerate(_corners(texture, 2 * side)):
         four = [taken.get((top + y, left + x)) for y in (0, side) for x in (0, side)]
         parts = [sizes for sizes in four if sizes is not None]
-        if index % JOINED_EVERY or len(parts) < len(four):
+        if index % JOINED_EVERY or len(parts) < min(len(four), 2 * -(-texture.shape[0] // side)):
             continue
         whole = _averaged(_tile(texture, top, left, 2 * side), measured.p)
         joined = [len(encode_texture(whole, measured.codec, quality)) for quality in measured.qualities]
-        saved.append((np.sum(parts, axis=0) - joined) / 3)
+        saved.append((np.sum(parts, axis=0) - joined) / (len(parts) - 1))
     if not saved:
         return np.zeros(len(measured.qualities))
     usual = np.median(list(taken.values()), axis=0)

