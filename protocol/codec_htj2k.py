@@ -84,11 +84,11 @@ def restore(payload: bytes, shape: tuple[int, ...], quality: float) -> bytes:
 
 
 def decomposition_levels(shape: tuple[int, ...]) -> int:
-    """Wavelet levels: halve until the shorter side is 1 or 2 samples, at least once, at most LEVELS_MAX times.
+    """Wavelet levels: halve, upward, until the shorter side is 2 samples, at least once, at most LEVELS_MAX times.
 
-    What is left of an image when it is halved no more costs most: one level less takes 6% more for a low, long image.
+    What is left of an image when it is halved no more costs most: one level less takes up to 17% more, one more 6%.
     """
-    return min(max(min(shape[:2]).bit_length() - 1, 1), LEVELS_MAX)
+    return min(max((min(shape[:2]) - 1).bit_length() - 1, 1), LEVELS_MAX)
 
 
 @lru_cache(maxsize=256)

@@ -87,7 +87,7 @@ const sampleBits = ({ components }: ImageShape, quality: number): number =>
   components === 3 && quality === LOSSLESS ? 8 : 16;
 
 function decompositionLevels({ height, width }: ImageShape): number {
-  const bitLength = 32 - Math.clz32(Math.min(height, width));
+  const bitLength = 32 - Math.clz32(Math.min(height, width) - 1);
   return Math.min(Math.max(bitLength - 1, 1), LEVELS_MAX);
 }
 
