@@ -52,16 +52,16 @@ class Place:
     theta_h: float
 
 
-def places() -> dict[str, list[Place]]:
-    """The four places, along x, away from it, along y, away from it, by the kind of look."""
-    equator = [0.0, math.pi, math.pi / 2, 1.5 * math.pi]
+def places(about: tuple[str, ...] = ABOUT) -> dict[str, list[Place]]:
+    """The places, along x, away from it, along y, away from it, by the kind of look; only the first two about y."""
+    equator = [0.0, math.pi, math.pi / 2, 1.5 * math.pi][: 2 * len(about)]
     found = {
         "cylinder": [Place("cylinder", math.pi / 2, theta_h) for theta_h in equator],
         "equator": [Place("standing", math.pi / 2, theta_h) for theta_h in equator],
     }
     for name, away in AWAY.items():
         found[name] = [
-            Place(f"{name} about {ABOUT[index // 2]}", math.pi - away if index % 2 else away, theta_h)
+            Place(f"{name} about {about[index // 2]}", math.pi - away if index % 2 else away, theta_h)
             for index, theta_h in enumerate(equator)
         ]
     return found
@@ -80,11 +80,16 @@ Cells = tuple[IntArray, IntArray]
 ASKED = {"bytes": "<= 1.2", "node time": "<= 1.2", "Draco + JPEG / ours": ">= 15"}
 
 
-def run(size: str, repeats: int, *, rival: bool = True) -> dict[str, Any]:
-    """Every place, `repeats` times on a fresh model, a target's look and one with explicit parameters."""
+def run(
+    size: str, repeats: int, *, rival: bool = True, about: tuple[str, ...] = ABOUT
+) -> dict[str, Any]:
+    """Every place, `repeats` times on a fresh model, a target's look and one with explicit parameters.
+
+    about : axes the object is turned about; two places each.
+    """
     target = Target()
-    scans = {name: BenchScan(name, size, grid) for name, grid in _grids(SIZES[size])}
-    rows = asyncio.run(_looks(scans, target, repeats))
+    scans = {name: BenchScan(name, size, grid) for name, grid in _grids(SIZES[size], about)}
+    rows = asyncio.run(_looks(scans, places(about), target, repeats))
     record = {"size": size, "rows": rows, "verified": all(row["reached"] for row in rows if row["kind"] == "target")}
     if rival:
         record["rival_bytes"] = _rival_bytes(scans["pole about y"].grid, target)
@@ -110,8 +115,10 @@ def told(record: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-async def _looks(scans: dict[str, BenchScan], target: Target, repeats: int) -> list[dict[str, Any]]:
-    every = [(name, turn, place) for name, found in places().items() for turn, place in enumerate(found)]
+async def _looks(
+    scans: dict[str, BenchScan], where: dict[str, list[Place]], target: Target, repeats: int
+) -> list[dict[str, Any]]:
+    every = [(name, turn, place) for name, found in where.items() for turn, place in enumerate(found)]
     every.sort(key=lambda one: one[1])  # in turns, so that what else the machine does hits all alike
     rows = []
     async with node_with(scans.values()) as (session, ids):
@@ -121,40 +128,49 @@ async def _looks(scans: dict[str, BenchScan], target: Target, repeats: int) -> l
             return await _look(session, scan, ids[scan.key], [place.theta_v, place.theta_h], target, more, checked)
 
         for kind in ("target", "explicit"):
-            more = {
-                (name, turn): await _explicit(look, place) if kind == "explicit" else {} for name, turn, place in every
-            }
+            more: dict[tuple[str, int], dict[str, Any]] = {(name, turn): {} for name, turn, _ in every}
+            if kind == "explicit":
+                quality = FIRST_QUALITY
+                for name, turn, place in every:
+                    quality = await _enough(look, place, quality)
+                    more[name, turn] = _parameters(quality)
             looks: dict[tuple[str, int], list[dict[str, Any]]] = {key: [] for key in more}
             for again in range(max(repeats // ROUNDS_OF, 1)):
                 for name, turn, place in every:
                     looks[name, turn].append(await look(place, more[name, turn], again == 0))
-            rows += _rows(kind, looks)
+            rows += _rows(kind, where, looks)
     return rows
 
 
-async def _explicit(look: Callable[..., Awaitable[dict[str, Any]]], place: Place) -> dict[str, Any]:
-    """Explicit parameters for a place, with the lowest quality that leaves EXPLICIT_DB there."""
-    found: dict[int, bool] = {}
-    quality = FIRST_QUALITY
-    while not (found.get(quality) and found.get(quality - 1) is False):
-        texture = {"p": 1, "quality": quality - found.get(quality, False)}
-        parameters = {"parameters": {"range": {"p": 1, "quantum": 5}, "texture": texture}}
-        left = await look(place, parameters, True)
-        quality = texture["quality"]
-        found[quality] = left["texture_db"] >= EXPLICIT_DB
-        quality += not found[quality]
+async def _enough(look: Callable[..., Awaitable[dict[str, Any]]], place: Place, quality: int) -> int:
+    """The lowest quality of texture that leaves EXPLICIT_DB at a place, looked for from one that may be near it."""
+    reaches: dict[int, bool] = {}
+    while True:
+        if quality not in reaches:
+            reaches[quality] = (await look(place, _parameters(quality), True))["texture_db"] >= EXPLICIT_DB
+        if not reaches[quality]:
+            quality += 1
+        elif reaches.get(quality - 1) is False:
+            return quality
+        else:
+            quality -= 1
+
+
+def _parameters(quality: int) -> dict[str, Any]:
     return {"parameters": {"range": {"p": 1, "quantum": 5}, "texture": {"p": 1, "quality": quality}}}
 
 
-def _rows(kind: str, looks: dict[tuple[str, int], list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """What looks of one kind came to at each kind of place: medians at each of the four, and the worst they left."""
+def _rows(
+    kind: str, where: dict[str, list[Place]], looks: dict[tuple[str, int], list[dict[str, Any]]]
+) -> list[dict[str, Any]]:
+    """What looks of one kind came to at each kind of place: medians at each of them, and the worst they left."""
 
     def medians(name: str, what: str) -> list[float]:
-        return [median(look[what] for look in found) for (where, _), found in looks.items() if where == name]
+        return [median(look[what] for look in looks[name, turn]) for turn in range(len(where[name]))]
 
     rows = []
-    for name in places():
-        first = [found[0] for (where, _), found in looks.items() if where == name]
+    for name, found in where.items():
+        first = [looks[name, turn][0] for turn in range(len(found))]
         row: dict[str, Any] = {"kind": kind, "place": name}
         for what, ratios in (("bytes", "bytes_ratios"), ("node_ms", "node_ratios")):
             row[what] = medians(name, what)
@@ -256,13 +272,13 @@ def _jpeg_bytes(grid: Grid, target: Target) -> int:
     raise ValueError("no JPEG is good enough")
 
 
-def _grids(size: tuple[int, int, int, int]) -> Iterator[tuple[str, Grid]]:
+def _grids(size: tuple[int, int, int, int], turned_about: tuple[str, ...]) -> Iterator[tuple[str, Grid]]:
     """The scans by name."""
     standing = _object(size, np.eye(3))
     yield "cylinder", replace(standing, spec=replace(standing.spec, geometry="cylinder"))
     yield "standing", thin_grid(standing)
     for name, away in AWAY.items():
-        for about in ABOUT:
+        for about in turned_about:
             yield f"{name} about {about}", thin_grid(_object(size, turned(about, away)))
 
 

@@ -66,7 +66,7 @@ def test_the_page_is_measured_beside_an_empty_one(scan: BenchScan) -> None:
 
 
 def test_clicks_on_a_closed_object_reach_their_quality() -> None:
-    record = sphere.run("S", 1)
+    record = sphere.run("S", 1, about=("y",))
     assert record["verified"]
     assert {row["place"] for row in record["rows"]} == set(sphere.places())
     ours = max(max(row["bytes"]) for row in record["rows"] if row["kind"] == "target")
