@@ -32,7 +32,7 @@ from protocol.reconstruct import (
 )
 from protocol.refinement import Generator, Refinement
 from protocol.sphere import default_mesh, ranges_on, vectors
-from protocol.strips import Strip, Strips, blocks_of, build_strips, samples_of, select_strips, split_parts
+from protocol.strips import Strip, Strips, blocks_of, build_strips, image_shape, samples_of, select_strips, split_parts
 
 Codec = TypeVar("Codec", RangeCodec, TextureCodec)
 Array = TypeVar("Array", NDArray[np.float32], StepArray, ImageArray)
@@ -233,7 +233,9 @@ def _range_patches(refinement: Refinement, strips: Strips) -> list[StepArray]:
 def _texture_patches(refinement: Refinement, strips: Strips) -> list[ImageArray]:
     """The same of texture."""
     parts = zip(_selections(strips), split_parts(refinement.payload, len(strips)), strict=True)
-    return [texture_patch(one, texture_of(refinement, one.sample_shape, payload)) for one, payload in parts]
+    codec = _codec(TextureCodec, refinement.codec)
+    images = ((one, texture_of(refinement, image_shape(one, codec), payload)) for one, payload in parts)
+    return [texture_patch(one, image[: one.sample_shape[0]]) for one, image in images]
 
 
 def texture_of(refinement: Refinement, shape: tuple[int, int], payload: bytes | None = None) -> ImageArray:

@@ -120,7 +120,8 @@ def close_scan(
     if hidden > HIDDEN_MAX:
         raise ExchangeError(
             f"scan: {hidden:.1%} of its surface is hidden from its centre, more than {HIDDEN_MAX:.0%}; "
-            "it is not star-shaped: keep it as a cylinder"
+            "it is not star-shaped, and that part would be lost: try another centre (--centre-height), or keep it "
+            "as a cylinder"
         )
     swept, rounded, capped = map(solid_share, (source >= _Source.SWEEP, source == _Source.ROUND, source == _Source.CAP))
     is_void = np.equal(closed.range_steps, VOID)

@@ -81,8 +81,9 @@ def close_mesh(
         )
     if seen.hidden > HIDDEN_MAX:
         raise ExchangeError(
-            f"mesh: {seen.hidden:.1%} of its surface is hidden from its centre, more than {HIDDEN_MAX:.0%}; "
-            "it is not star-shaped: import it as a cylinder (--geometry cylinder)"
+            f"mesh: {seen.hidden:.1%} of its surface is hidden from its centre at {centre_mm:.1f} mm, more than "
+            f"{HIDDEN_MAX:.0%}; it is not star-shaped, and that part would be lost: try another centre "
+            "(--centre-height), bring its parts one by one, or what its axis sees of it (--geometry cylinder)"
         )
     return grid, seen
 

@@ -22,7 +22,7 @@ from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
-from protocol.strips import Strips, build_strips, join_parts, select_strips
+from protocol.strips import Strips, build_strips, image_shape, join_parts, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
@@ -87,10 +87,17 @@ def select_texture_lattice(state: ClientState, parameters: Parameters, quality: 
 
 def code_texture_strips(scan: Scan, strips: Strips, quality: float, codec: TextureCodec, *, quick: bool) -> Coded:
     """Encode what was selected."""
-    texels = (texture_samples(scan, strip.selection) for strip in strips)
-    payloads = [encode_texture(image, codec, quality, quick=quick) for image in texels]
+    images = (_image(scan, strip.selection, codec) for strip in strips)
+    payloads = [encode_texture(image, codec, quality, quick=quick) for image in images]
     parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
     return Coded(parts, texture_rank(int(quality)), quality, codec, join_parts(payloads))
+
+
+def _image(scan: Scan, selection: Selection, codec: TextureCodec) -> ImageArray:
+    """The texels of a strip as they travel."""
+    texels = texture_samples(scan, selection)
+    more = image_shape(selection, codec)[0] - len(texels)
+    return np.concatenate([texels, texels[-1:]]) if more else texels
 
 
 def select_texture(state: ClientState, region: Region, wanted: TextureParameters) -> tuple[Strips, int]:
@@ -143,8 +150,9 @@ def measured(coded: Coded) -> Coded:
 def _measured(part: Part, coded: Coded) -> Part:
     if part.patch is not None:
         return part
-    texels = decode_texture(part.payload, TextureCodec(coded.codec), int(coded.quality), part.selection.sample_shape)
-    return replace(part, patch=texture_patch(part.selection, texels))
+    selection, codec = part.selection, TextureCodec(coded.codec)
+    image = decode_texture(part.payload, codec, int(coded.quality), image_shape(selection, codec))
+    return replace(part, patch=texture_patch(selection, image[: selection.sample_shape[0]]))
 
 
 def adopted_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, float]:

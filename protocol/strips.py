@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from protocol.codec import TextureCodec
 from protocol.errors import CodecError
 from protocol.grid import BoolArray, IntArray
 from protocol.holdings import ChannelHoldings
@@ -85,6 +86,16 @@ def samples_of(strips: Strips) -> int:
 def blocks_of(strips: Strips) -> IntArray:
     """Flat indices of the adopted blocks, strip after strip. (n,) int64"""
     return np.concatenate([np.zeros(0, np.int64), *(strip.selection.adopted_blocks() for strip in strips)])
+
+
+def image_shape(selection: Selection, codec: TextureCodec) -> tuple[int, int]:
+    """Rows and columns of the image in which a selection's texels travel: on a sphere as HTJ2K an odd number of rows.
+
+    Where they were even the last one stands there twice. Else a wavelet ends on a sample that it predicts, and misses
+    the last rows twice as far as others, which shows as an arc where two strips meet.
+    """
+    rows, columns = selection.sample_shape
+    return (rows | 1 if selection.lattice.shape.sphere and codec is TextureCodec.HTJ2K else rows), columns
 
 
 def join_parts(parts: Sequence[bytes]) -> bytes:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protocol.codec import TextureCodec
 from protocol.codec_lift import Survey, decode_all, encode_surveyed
 from protocol.errors import CodecError, LatticeError
 from protocol.grid import VOID, BoolArray, StepArray
@@ -18,7 +19,7 @@ from protocol.holdings import ChannelHoldings, range_rank, texture_rank
 from protocol.lattice import STRIDE_SETS, STRIDES, Channel, ChannelShape, Parameters, build_lattice, mask_to_runs
 from protocol.reconstruct import Selection, cut, paste, range_patch, select, texture_patch
 from protocol.rings import ring_strides, thin_rings, thin_texture
-from protocol.strips import blocks_of, build_strips, join_parts, samples_of, select_strips, split_parts
+from protocol.strips import blocks_of, build_strips, image_shape, join_parts, samples_of, select_strips, split_parts
 from tests.golden.write_sphere import FOLDER, scan_of, vectors
 
 SHAPE = ChannelShape(Channel.RANGE, 96, 184, 6, 12, True)
@@ -204,6 +205,17 @@ parts = st.lists(st.binary(max_size=9), min_size=1, max_size=5)
 @given(parts)
 def test_parts_come_back(parts: list[bytes]) -> None:
     assert split_parts(join_parts(parts), len(parts)) == parts
+
+
+def test_texture_of_a_sphere_travels_in_an_odd_number_of_rows_as_htj2k() -> None:
+    parameters = Parameters(2, 0, 0, 3, 2)
+    for sphere in (True, False):
+        shape = ChannelShape(Channel.TEXTURE, 96, 64, 12, 8, sphere)
+        (strip, *_) = select_strips(build_strips(shape, parameters), ChannelHoldings.coarse(shape), texture_rank(40))
+        rows, columns = strip.selection.sample_shape
+        assert rows % 2 == 0
+        assert image_shape(strip.selection, TextureCodec.HTJ2K) == (rows + sphere, columns)
+        assert image_shape(strip.selection, TextureCodec.JPEG) == (rows, columns)
 
 
 def test_one_part_and_nothing_have_no_length() -> None:

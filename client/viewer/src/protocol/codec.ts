@@ -11,7 +11,7 @@ import type { Htj2kDecoder } from './codec_htj2k.ts';
 
 const RAW = 0;
 const JPEG = 1;
-const HTJ2K = 2;
+export const HTJ2K = 2;
 const LIFT = 3;
 const SIDE_MAX = 16384;
 const SAMPLES_MAX = 1 << 25;

@@ -14,7 +14,7 @@ import {
 import type { Chosen, Selection, Span } from './reconstruct.ts';
 import { COARSE } from './refinement.ts';
 import type { Refinement } from './refinement.ts';
-import { buildStrips, samplesOf, selectStrips, splitParts } from './strips.ts';
+import { buildStrips, imageRows, samplesOf, selectStrips, splitParts } from './strips.ts';
 
 const STATEMENTS_MAX = 3;
 
@@ -200,7 +200,8 @@ async function texturePatches({ payload, mask, codec, quality }: Refinement, str
   const payloads = splitParts(payload, strips.length);
   return Promise.all(strips.map(async ({ selection }, index) => {
     const { x, y } = selection;
-    return texturePatch(selection, await codecs.texture(payloads[index]!, codec, y.sample.length, x.sample.length, quality));
+    const texels = await codecs.texture(payloads[index]!, codec, imageRows(selection, codec), x.sample.length, quality);
+    return texturePatch(selection, texels.subarray(0, 4 * y.sample.length * x.sample.length));
   }));
 }
 

@@ -1,6 +1,7 @@
 // What a refinement carries of a sphere: its rows of blocks in strips that are as dense along as across. A cylinder is
 // a single one. Mirrors protocol/strips.py (PROTOCOL.md, "Spheres").
 
+import { HTJ2K } from './codec.ts';
 import { RemoteWireError } from './errors.ts';
 import type { ChannelHoldings } from './holdings.ts';
 import {
@@ -8,7 +9,7 @@ import {
 } from './lattice.ts';
 import type { Axis, ChannelShape, Lattice, Parameters } from './lattice.ts';
 import { select, selectionSamples } from './reconstruct.ts';
-import type { Chosen } from './reconstruct.ts';
+import type { Chosen, Selection } from './reconstruct.ts';
 import { ringStrides } from './rings.ts';
 
 const LENGTH_BYTES = 4;
@@ -39,6 +40,12 @@ export function selectStrips(lattices: Lattice[], held: ChannelHoldings, rank: n
 
 /** Values in a payload. */
 export const samplesOf = (strips: Chosen[]): number => strips.reduce((sum, { selection }) => sum + selectionSamples(selection), 0);
+
+/** Rows of the image in which a selection's texels travel: on a sphere as HTJ2K an odd number, the last repeated. */
+export function imageRows({ lattice, y }: Selection, codec: number): number {
+  const rows = y.sample.length;
+  return lattice.shape.sphere && codec === HTJ2K ? rows | 1 : rows;
+}
 
 /** A payload, or a mask, as the strips' own. Throws RemoteWireError. */
 export function splitParts(data: Uint8Array, count: number): Uint8Array[] {
