@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -155,8 +156,8 @@ def _part_beyond(scan: Scan, part: Part, region: Region, target_steps: float) ->
     """The same of a strip. An own sample counts for the cells up to the next one too."""
     selection, inside = part.selection, own_inside(region, part.selection)
     own = slice(0, inside.shape[1])
-    truth = np.asarray(cut(scan.range_steps, selection), np.int32)[:, own]
-    far = np.abs(part.range_steps[:, own].astype(np.int32) - truth) > target_steps
+    truth = np.asarray(cut(scan.range_steps, selection), np.uint16)[:, own]
+    far = cv2.absdiff(part.range_steps[:, own], truth) > target_steps
     far &= (truth != VOID) & selection.adopted_cells() & inside
     area = region.sample_area(selection.y.start + np.arange(len(far)))
     return selection.lattice.shape.stride * float(np.count_nonzero(far, axis=1) @ area)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.grid import RANGE_BLOCK, VOID, FloatArray, GridSpec, IntArray, StepArray
+from protocol.grid import RANGE_BLOCK, VOID, BoolArray, FloatArray, GridSpec, IntArray, StepArray
 from protocol.region import Region
 from protocol.rings import ring_strides
 
@@ -28,6 +29,16 @@ def percentile_of(counts: FloatArray | IntArray) -> int:
     total = float(upto[-1]) if upto.size else 0.0
     wanted = min((total - 1) * PERCENTILE / 100 + 1, total)
     return int(np.searchsorted(upto, wanted - _SLACK)) if total else 0
+
+
+def how_often(values: NDArray[np.uint8] | StepArray, counts: BoolArray, largest: int | None = None) -> FloatArray:
+    """How often each value 0, 1, 2 ... up to the largest stands where it counts. values, counts : (h, w)"""
+    if not values.size:
+        return np.zeros(1 + (largest or 0))
+    mask = counts.view(np.uint8)
+    if largest is None:
+        largest = int(cv2.minMaxLoc(values, mask)[1]) if counts.any() else 0
+    return np.asarray(cv2.calcHist([values], [0], mask, [largest + 1], [0, largest + 1]).ravel(), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,8 +101,8 @@ def _strides(spec: GridSpec, p: int) -> IntArray:
 def _counted(codes: NDArray[np.uint8], region: Region, rows: IntArray, columns: IntArray) -> FloatArray:
     """How often each code stands in a region, by area. (256,)"""
     inside, area = region.inside(rows, columns), region.sample_area(rows)
-    if inside.all() and (area == 1).all():
-        return np.bincount(codes.ravel(), minlength=UNMEASURED + 1).astype(np.float64)
+    if (area == 1).all():
+        return how_often(codes, inside, UNMEASURED)
     weight = np.repeat(area, np.count_nonzero(inside, axis=1))
     return np.asarray(np.bincount(codes[inside], weight, minlength=UNMEASURED + 1), np.float64)
 

@@ -74,7 +74,11 @@ class RangeSearch:
             return self._with_skirt(guess)
 
         def possible(p: int) -> Trial | None:
-            return self._trial(p) if self._interpolated(p) <= OVERSTATED * target_steps else None
+            error = self._interpolated(p)
+            trial = self._trial(p) if error <= OVERSTATED * target_steps else None
+            if trial is not None and error <= target_steps:
+                trial.assume(error)
+            return trial
 
         return self._with_skirt(choose_range(possible, target_steps, guess.p))
 

@@ -10,11 +10,12 @@ import math
 from collections.abc import Callable
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from node.coded import Coded, Part, framed, message_overhead, own_inside, region_lattice, rho_of
 from node.library import Scan
-from node.range_model import percentile_of
+from node.range_model import how_often, percentile_of
 from node.sample import range_samples, void_cells
 from node.state import ClientState, block_errors
 from protocol.codec import RangeCodec, encode_mask
@@ -183,6 +184,10 @@ class Trial:
             self._errors[quantum] = float(percentile_of(total))
         return self._errors[quantum]
 
+    def assume(self, error: float) -> None:
+        """Quantum 1 leaves no more than this error: that is known, and not tried. [steps]"""
+        self._errors.setdefault(1, error)
+
     def expected_bytes(self, quantum: int) -> float:
         """About how many bytes the refinement takes."""
         return expected_bytes([part.survey(quantum) for part in self._parts])
@@ -197,9 +202,8 @@ class _TrialPart:
         inside = own_inside(region, selection)
         rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
         self._crop = _around(rows), _around(columns)
-        truth = np.asarray(cut(scan.range_steps, selection))[self._crop]
-        self._counts = inside[self._crop] & (truth != VOID)
-        self._truth = truth[self._counts].astype(np.int32)
+        self._truth = np.asarray(cut(scan.range_steps, selection), np.uint16)[self._crop]
+        self._counts = inside[self._crop] & (self._truth != VOID)
         area = selection.lattice.shape.stride * region.sample_area(selection.y.start + rows)
         self._weight = None if (area == 1).all() else np.repeat(area, np.count_nonzero(self._counts, axis=1))
         self._surveys: dict[int, Survey] = {}
@@ -208,7 +212,10 @@ class _TrialPart:
         """How many measured samples in the region are off by 0, 1, 2 ... steps, each weighed by its area."""
         samples = self._samples if quantum == 1 else self.survey(quantum).decoded
         patch = range_patch(self._selection, samples)[self._crop]
-        return np.bincount(np.abs(patch[self._counts].astype(np.int32) - self._truth), self._weight)
+        off = np.asarray(cv2.absdiff(patch, self._truth), np.uint16)
+        if self._weight is None:
+            return how_often(off, self._counts)
+        return np.bincount(off[self._counts], self._weight)
 
     def survey(self, quantum: int) -> Survey:
         """What the strip would take."""

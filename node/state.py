@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,9 +107,9 @@ def block_errors(
     heights, widths : cells of each row and column of blocks.  stride : how many grid columns each cell stands for.
     Returns (rows, columns) uint16 [steps], and (8 rows, columns) uint8 of bits.
     """
-    difference = np.abs(patch.astype(np.int32) - truth)
+    difference = np.asarray(cv2.absdiff(patch, np.asarray(truth)), np.uint16)
     difference[truth == VOID] = 0
     padded = pad_blocks(difference.repeat(stride, axis=1), heights, widths * stride, RANGE_BLOCK)
     rows, columns = heights.size, widths.size
-    largest = padded.reshape(rows, RANGE_BLOCK, columns, RANGE_BLOCK).max(axis=(1, 3))
-    return largest.astype(np.uint16), np.packbits(padded > target_steps, axis=1)
+    largest = padded.reshape(rows, RANGE_BLOCK, -1).max(axis=1).reshape(rows, columns, RANGE_BLOCK).max(axis=2)
+    return largest, np.packbits(padded > target_steps, axis=1)

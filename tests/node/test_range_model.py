@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ import pytest
 from node.first_view import build_first_view
 from node.library import Scan
 from node.quality import Encodes
-from node.range_model import SPACINGS, RangeModel, percentile_of
+from node.range_model import SPACINGS, RangeModel, how_often, percentile_of
 from node.range_search import RangeSearch
-from node.refine_range import trial_of
+from node.refine_range import _TrialPart, trial_of
 from protocol.grid import Grid, GridSpec
 from protocol.messages import Look
 from protocol.region import region_round
@@ -110,3 +111,34 @@ def test_weighed_values_count_by_their_area() -> None:
     assert percentile_of(np.array([500.0, 400.0, 8.0])) == 1  # as near a pole, where a thousand samples have little
     assert percentile_of(np.zeros(3)) == percentile_of(np.zeros(0)) == 0
     assert percentile_of(np.array([0.0, 0.2])) == 1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_values_are_counted_where_they_count(dtype: Any) -> None:
+    rng = np.random.default_rng(3)
+    values = np.asarray(rng.integers(0, 200, (40, 50)), dtype)
+    counts = rng.random((40, 50)) < 0.7
+    often = how_often(values, counts)
+    np.testing.assert_array_equal(often, np.bincount(values[counts]))
+    np.testing.assert_array_equal(how_often(values, counts, 255)[: often.size], often)
+    assert how_often(values, np.zeros_like(counts)).sum() == 0
+    assert how_often(values[:0], counts[:0]).sum() == 0
+
+
+def test_what_is_known_of_the_range_spares_a_trial(scan: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
+    view, model = build_first_view(scan, "htj2k", 32768), RangeModel(scan.spec, scan.range_steps, scan.filled)
+    region = region_round(0.62, 0.3, 0.05, scan.spec.width, scan.spec.height)
+    tried: list[int] = []
+    errors = _TrialPart.errors
+
+    def noted(part: _TrialPart, quantum: int) -> Any:
+        tried.append(quantum)
+        return errors(part, quantum)
+
+    monkeypatch.setattr(_TrialPart, "errors", noted)
+    look = Look(1, 0.62, 0.3, range_mm=1.0)
+    search = RangeSearch(scan, view.state, look, region, model, False, Encodes(lambda: False))
+    found = search.choose(search.target_steps)
+    assert tried and 1 not in tried
+    trial = trial_of(scan, view.state, region, found.p)
+    assert trial is not None and trial.error(found.quantum) <= search.target_steps
