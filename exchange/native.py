@@ -106,7 +106,7 @@ class _Members:
         with self._archive.open(f"{key}.npy") as member:
             try:
                 shape, fortran, found = _header(member)  # type: ignore[arg-type]  # numpy types a file wider than it reads
-            except (ValueError, TokenError) as problem:  # numpy parses it as Python
+            except (ValueError, TokenError, SyntaxError) as problem:  # numpy parses it as Python
                 raise ExchangeError(f"{key}: is no array in the .npy format, or damaged") from problem
             if not issubclass(found.type, kinds) or len(shape) != dimensions:
                 expected = f"{dimensions} dimensions of {' or '.join(kind.__name__ for kind in kinds)}"

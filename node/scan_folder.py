@@ -152,7 +152,7 @@ def read_grid(folder: Path, spec: GridSpec) -> Grid:
     try:
         range_steps, texture = (_mapped(folder / name) for name in (RANGE_FILE, TEXTURE_FILE))
         return Grid(spec, range_steps, texture, _read_repairs(folder / REPAIRS_FILE))
-    except (OSError, ValueError, EOFError, OverflowError, TokenError) as error:  # numpy parses headers as Python
+    except (OSError, ValueError, EOFError, OverflowError, TokenError, SyntaxError) as error:  # headers are Python
         raise LibraryError(f"its samples cannot be read: {error}") from error
 
 

@@ -172,3 +172,12 @@ def test_a_rotten_byte_is_refused() -> None:
     data[data.index(b"depth_u16.npy") + 900] ^= 1
     with pytest.raises(ExchangeError, match="damaged"):
         read_native(io.BytesIO(data))
+
+
+def test_a_header_that_is_no_python_is_a_damaged_array() -> None:
+    damaged = io.BytesIO()
+    with zipfile.ZipFile(packed(texture=TEXTURE)) as sound, zipfile.ZipFile(damaged, "w") as archive:
+        for name in sound.namelist():
+            archive.writestr(name, sound.read(name).replace(b"'<u2'", b"'<02'"))
+    with pytest.raises(ExchangeError, match="depth_u16: is no array"):
+        read_native(damaged)

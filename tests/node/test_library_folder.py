@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from node.library import Library, survey, verify
+from node.scan_folder import read_grid
 from protocol.errors import LibraryError
 from tests.node.library_cases import ABOUT, SPEC, entries, files_in, noise, reopened
 
@@ -226,3 +227,12 @@ def test_a_library_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "library").write_text("")
     with pytest.raises(LibraryError, match="cannot be used"):
         Library(tmp_path / "library")
+
+
+def test_samples_whose_header_is_no_python_are_damaged(tmp_path: Path) -> None:
+    scan = Library(tmp_path).add(noise(0), ABOUT)
+    file = tmp_path / scan.id / "range.npy"
+    file.chmod(0o600)
+    file.write_bytes(file.read_bytes().replace(b"'<u2'", b"'<02'", 1))
+    with pytest.raises(LibraryError, match="its samples cannot be read"):
+        read_grid(tmp_path / scan.id, scan.spec)
