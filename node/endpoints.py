@@ -113,6 +113,10 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         Endpoint(
             "GET", "/v1/scans/{scan}/coarse", "its first view", query=b.CoarseQuery, gives={200: BINARY}, event="seen"
         ),
+        Endpoint(
+            "GET", "/v1/scans/{scan}/picture", "a picture of its first view",
+            gives={200: {"image/webp": bytes}}, event="seen",
+        ),
     )),
     ("view", "look at places without a stream, or by way of a cache", (
         Endpoint(

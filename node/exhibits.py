@@ -18,6 +18,7 @@ import msgspec
 from node.classic import ClassicView, build_classic_view
 from node.first_view import FirstView, build_first_view, scan_info, texture_as_seen
 from node.library import Library, Scan
+from node.picture import draw_picture
 from node.range_model import RangeModel
 from node.right_of_way import RightOfWay
 from node.texture_model import TextureModel
@@ -25,6 +26,7 @@ from protocol.errors import LibraryError
 from protocol.messages import CodecName, Profile
 
 VIEWS_MAX = 8
+PICTURES_MAX = 64  # of some 10 KB
 GIVES_WAY = 10  # niceness of threads that compute for clients: a scanner does not wait
 MODELS_MAX = 8
 PRESSING = 2  # looks that wait for each thread
@@ -54,6 +56,7 @@ class Exhibits:
         self._working = 0
         self._moved_s = 0.0
         self._views: OrderedDict[Key, asyncio.Future[Opening]] = OrderedDict()
+        self._pictures: OrderedDict[str, asyncio.Future[bytes]] = OrderedDict()
         self._closing = threading.Event()
         self._surveyor = ThreadPoolExecutor(1, "survey", _give_way)
         self._models: OrderedDict[str, tuple[Future[RangeModel], Future[TextureModel]]] = OrderedDict()
@@ -83,6 +86,21 @@ class Exhibits:
             self._survey(scan, view)
         return self._up_to_date(scan, view)
 
+    async def picture(self, scan_id: str) -> tuple[str, bytes]:
+        """The id of a scan, and a picture of its first view (WebP). Raises LibraryError when there is none such."""
+        key = self.library.resolve(scan_id)
+        if key not in self._pictures:
+            drawn = self.work(lambda: draw_picture(self.library.open(key).coarse), "view")
+            self._pictures[key] = asyncio.ensure_future(drawn)
+            while len(self._pictures) > PICTURES_MAX:
+                self._pictures.popitem(last=False)
+        self._pictures.move_to_end(key)
+        try:
+            return key, await asyncio.shield(self._pictures[key])
+        except LibraryError:
+            self._pictures.pop(key, None)
+            raise
+
     def texture_model(self, scan: Scan) -> TextureModel | None:
         """What the scan's texture takes and reaches; None until that is measured."""
         return _done(self._models[scan.id][1]) if scan.id in self._models else None
@@ -101,6 +119,7 @@ class Exhibits:
         for key in [key for key in self._views if key[0] == scan_id]:
             del self._views[key]
         self._models.pop(scan_id, None)
+        self._pictures.pop(scan_id, None)
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[bool]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,9 +26,10 @@ MEDIA_TYPES = {
 FOR_EVER = "public, max-age=31536000, immutable"
 ASK_AGAIN = "no-cache"
 POLICY = (
-    "default-src 'none'; script-src 'self'{wasm}; worker-src 'self'; connect-src 'self'; style-src 'self'; "
+    "default-src 'none'; script-src 'self'{more}; worker-src 'self'; connect-src 'self'; style-src 'self'; "
     "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+WITHIN = re.compile(rb"<script>(.+?)</script>", re.DOTALL)
 NOT_BUILT = "The page is not built: run `make`, or install the wheel. The command `foveascan look` works anyway.\n"
 
 
@@ -36,6 +39,7 @@ class _File:
     body: bytes
     packed: bytes
     tag: str
+    policy: str
 
 
 class Page:
@@ -67,22 +71,28 @@ def _built(folder: Path) -> list[Path]:
 
 def _read(path: Path) -> _File:
     body = path.read_bytes()
+    # A worker takes its policy from its own script's response: WASM may be compiled there and nowhere else.
+    more = " 'wasm-unsafe-eval'" if path.name.startswith("worker-") else "".join(map(_named, WITHIN.findall(body)))
     packed = path.with_name(f"{path.name}.gz")
     return _File(
         MEDIA_TYPES[path.suffix],
         body,
         packed.read_bytes() if packed.exists() else gzip.compress(body),
         f'"{hashlib.sha256(body).hexdigest()[:32]}"',
+        POLICY.format(more=more),
     )
 
 
+def _named(script: bytes) -> str:
+    """A script that stands within the page, as the policy names what may run."""
+    return f" 'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"
+
+
 def _respond(request: web.Request, file: _File, cache: str) -> web.Response:
-    # A worker takes its policy from its own script's response: WASM may be compiled there and nowhere else.
-    is_worker = request.match_info.get("name", "").startswith("worker-")
     headers = {
         "Content-Type": file.media_type,
         "Cache-Control": cache,
-        "Content-Security-Policy": POLICY.format(wasm=" 'wasm-unsafe-eval'" if is_worker else ""),
+        "Content-Security-Policy": file.policy,
         "Cross-Origin-Opener-Policy": "same-origin",
         "ETag": file.tag,
         "Vary": "Accept-Encoding",

@@ -96,6 +96,7 @@ class NodeServer:
         self._shared = SharedFoveae(exhibits, shared_cache=c.shared_cache, is_open=c.insecure)
         self._connections: dict[Connection, asyncio.Transport] = {}
         self._hanging_up: set[asyncio.Task[None]] = set()
+        self._drawing: set[asyncio.Task[None]] = set()
         self._requests: dict[int, web.Request] = {}  # those in work, by their id()
         self._gate = Gate(config.limits, is_open=c.insecure, proxies=c.trusted_proxies)
         self._metrics = Metrics()
@@ -118,6 +119,7 @@ class NodeServer:
             route("GET /v1/scans", self._scans),
             route("GET /v1/scans/{scan}", self._scan),
             route("GET /v1/scans/{scan}/coarse", self._coarse),
+            route("GET /v1/scans/{scan}/picture", self._picture),
             route("POST /v1/sweeps", self._sweep),
             route("GET /v1/stream", self._stream),
             *self._shared.routes(),
@@ -136,6 +138,7 @@ class NodeServer:
         server, context = self._config.server, self._tls.context if self._tls else None
         host, port = await self._gate.open(self._runner, server.host, server.port, context)
         self._watching = [asyncio.create_task(self._watch_access()), asyncio.create_task(self._retain())]
+        self._draw_newest()
         self.audit.note("started", NODE, what=self._info.version)
         return host, port
 
@@ -245,6 +248,17 @@ class NodeServer:
         """Tell every client of a new scan."""
         for connection in self._connections:
             connection.publish(news)
+        self._draw_newest()
+
+    def _draw_newest(self) -> None:
+        """Have the picture ready that a page will ask for first."""
+
+        async def draw() -> None:
+            with suppress(LibraryError):
+                await self._exhibits.picture("latest")
+
+        self._drawing.add(task := asyncio.create_task(draw()))
+        task.add_done_callback(self._drawing.discard)
 
     def _forget(self, scan_id: str) -> None:
         """A scan was deleted: nothing made of it is kept here any longer."""
@@ -308,6 +322,10 @@ class NodeServer:
         body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
         headers = self._shared.cache_headers(request, scan)
         return web.Response(body=body, content_type="application/octet-stream", headers=headers)
+
+    async def _picture(self, request: web.Request) -> web.Response:
+        request[SCAN], picture = await self._exhibits.picture(request.match_info["scan"])
+        return web.Response(body=picture, content_type="image/webp")
 
     async def _sweep(self, request: web.Request) -> web.Response:
         if self._capture is None or not (number := self._capture.request_sweep()):

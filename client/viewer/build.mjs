@@ -35,13 +35,13 @@ async function page(out) {
   const { outputs } = (await build({ ...common, define: admin, entryPoints: ['src/worker.ts', 'src/main.ts', 'src/style.css'] })).metafile;
   const [worker, script, style] = ['worker.ts', 'main.ts', 'style.css'].map((entry) => named(outputs, `src/${entry}`));
   const define = { WORKER_FILE: JSON.stringify(worker), MAIN_FILE: JSON.stringify(script) };
-  const boot = named((await build({ ...common, define, entryPoints: ['src/boot.ts'] })).metafile.outputs, 'src/boot.ts');
+  const [{ text: boot }] = (await build({ ...common, define, format: 'iife', write: false, entryPoints: ['src/boot.ts'] })).outputFiles;
   const wasm = Object.keys(outputs).find((path) => path.endsWith('.wasm')).split('/').at(-1);
   const [scriptHash, styleHash] = await Promise.all([script, style, worker].map((name) => hashInline(join(out, name))));
   const notices = await licenses();
   const notice = `licenses-${createHash('sha256').update(notices).digest('hex').slice(0, 8)}.txt`;
   const names = { boot, script, style, worker, wasm, notice, scriptHash, styleHash };
-  const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name]);
+  const html = (await readFile('index.html', 'utf8')).replace(/%(\w+)%/g, (_, name) => names[name].trim());
   await writeFile(join(out, 'index.html'), html);
   for (const file of await readdir(out)) await squeeze(join(out, file));
   await writeFile(join(out, notice), notices);

@@ -1,8 +1,9 @@
 // Injected before a page's own scripts: notes in `window.bench` when frames are finished by the renderer, how long
-// messages of workers and frames keep the page's thread, its long tasks, and when what a picture needs was there first.
-// Changes nothing that a page does.
+// messages of workers and frames keep the page's thread, its long tasks, when the picture of the scan was painted that
+// stands there before, and when what a frame needs was there first. Says on the console when a frame is finished, and
+// changes nothing that a page does.
 (() => {
-  const bench = (window.bench = { frames: [], messages: [], painting: [], tasks: [], first: {}, clicked: null, answer: null });
+  const bench = (window.bench = { frames: [], messages: [], painting: [], tasks: [], first: {}, clicked: null, answer: null, poster: null });
   const first = (name) => (bench.first[name] ??= performance.now());
   const timed = (note, work) => {
     const begin = performance.now();
@@ -16,6 +17,9 @@
   new PerformanceObserver((list) => {
     for (const { startTime, duration } of list.getEntries()) bench.tasks.push([startTime, duration]);
   }).observe({ type: 'longtask', buffered: true });
+  new PerformanceObserver((list) => {
+    for (const { identifier, renderTime } of list.getEntries()) if (identifier === 'poster') bench.poster ??= renderTime;
+  }).observe({ type: 'element', buffered: true });
   addEventListener('pointerup', () => (bench.clicked = performance.now()), true);
 
   const ask = window.requestAnimationFrame.bind(window);
@@ -49,8 +53,9 @@
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     const look = () => {
-      if (gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED) frame.end = performance.now();
-      else setTimeout(look, 1);
+      if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return setTimeout(look, 1);
+      frame.end = performance.now();
+      console.debug(frame.scan ? 'frame of a scan' : 'frame');
     };
     look();
   };

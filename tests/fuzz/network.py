@@ -26,8 +26,8 @@ METHODS = ("GET", "GET", "POST", "PATCH", "DELETE", "HEAD", "OPTIONS")
 PATHS = (
     "/", "/healthz", "/metrics", "/pair", "/assets/x.js", "/openapi.json", "/v1/auth", "/v1/node", "/v1/tokens",
     "/v1/tokens/somebody", "/v1/codes", "/v1/pair", "/v1/audit?limit=3&since=2026&scan=6&by=x&refused=1", "/v1/stream",
-    "/v1/scans", "/v1/scans/latest", "/v1/scans/latest/coarse?codec=jpeg", "/v1/scans/latest.stl",
-    "/v1/scans/latest.npz", "/v1/scans/latest/fovea?u=0.5&v=0.5&max_bytes=900",
+    "/v1/scans", "/v1/scans/latest", "/v1/scans/latest/coarse?codec=jpeg", "/v1/scans/latest/picture",
+    "/v1/scans/latest.stl", "/v1/scans/latest.npz", "/v1/scans/latest/fovea?u=0.5&v=0.5&max_bytes=900",
     "/v1/scans/0/fovea/00000000/2.0.0.1.1.0.0.1/-", "/v1/scans/latest/sidecar", "/v1/scans/latest/verify",
     "/v1/scans/latest/derive", "/v1/sweeps", "/v1/sweeps/0.npz", "/v1/sweeps/0/resume", "/v1/sweeps/0",
     "/v1/axes", "/v1/axes/0",

@@ -61,7 +61,7 @@ export class App {
 
   constructor(
     root: HTMLElement, private readonly worker: Worker, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
-    hire: (scan: string) => Worker,
+    poster: HTMLImageElement | null, hire: (scan: string) => Worker,
   ) {
     const say = (text: string) => this.frame.say(text);
     this.frame = new Frame(root, {
@@ -106,6 +106,7 @@ export class App {
     this.pins = new Pins(this.pane, this.sidecar, () => this.writeState());
     this.about = new AboutPanel((changes) => void this.sidecar.save(changes, true), () => void this.remove(), (named) => this.copy(named));
     this.display = new DisplayPanel(() => this.showAs());
+    if (poster) this.pane.showMeanwhile(poster);
     this.frame.pictures.append(this.pane.element);
     this.frame.stage.append(this.display.legend);
     this.frame.showAfter(this.pane.pictured);
@@ -230,6 +231,7 @@ export class App {
   private watched(): void {
     this.frame.showEmpty(null);
     this.comparison.close();
+    this.pane.showMeanwhile(null);
     this.pane.marks.setPins([]);
     this.beginMeasuring();
   }

@@ -30,6 +30,8 @@ export interface Boot {
   said: MessageEvent<FromWorker>[];
   canvas: HTMLCanvasElement;
   context: WebGL2RenderingContext | null;
+  /** What is shown of the scan until the model of it stands. */
+  poster: HTMLImageElement | null;
   /** One more worker, for a scan of its own. */
   hire(scan: string): Worker;
 }

@@ -56,6 +56,7 @@ export class Pane {
   /** Kept once a first picture stands, or none will soon. */
   readonly pictured: Promise<void>;
   private painted!: () => void;
+  private poster: HTMLImageElement | null = null;
   private looks = 0;
   private looking: { look: number; place: Place } | null = null;
   private queue: Place[] = [];
@@ -75,7 +76,10 @@ export class Pane {
     setTimeout(() => this.painted(), PICTURE_MS);
     this.stage = new Stage(canvas, context, {
       drawn: () => this.drawn(),
-      moved: () => this.events.moved(),
+      moved: () => {
+        if (this.stage.moving) this.showMeanwhile(null);
+        this.events.moved();
+      },
       settled: () => this.events.changed(),
       lost: () => this.events.say(strings.link.graphicsLost),
       restored: () => this.restore(),
@@ -125,9 +129,17 @@ export class Pane {
     }
   }
 
+  /** Show a picture of the scan until it is drawn itself; null: no more. It is as the camera sees it that nobody has moved. */
+  showMeanwhile(poster: HTMLImageElement | null): void {
+    this.poster?.remove();
+    this.poster = poster;
+    if (poster) this.element.prepend(poster);
+  }
+
   /** Have another scan opened. */
   open(scan: string): void {
     this.info = null;
+    this.showMeanwhile(null);
     this.tell({ kind: 'open', scan });
   }
 
@@ -139,6 +151,7 @@ export class Pane {
   /** Show nothing. */
   clear(): void {
     this.painted();
+    this.showMeanwhile(null);
     this.info = null;
     delete this.noted.dataset['scan'];
     this.endLook();
@@ -170,7 +183,9 @@ export class Pane {
 
   private drawn(): void {
     this.marks?.update();
-    if (this.info) this.painted();
+    if (!this.info) return;
+    this.painted();
+    if (this.poster) void this.stage.done().then(() => this.showMeanwhile(null));
   }
 
   private opened({ snapshot, fresh }: Extract<OfScan, { kind: 'opened' }>): void {

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 
 from foveascan import started
 from node.library import About, Library
@@ -382,6 +382,19 @@ def test_pins_of_any_geometry_are_listed_and_stand_where_they_were_set(browser: 
             assert stands_at(page, f"mole of {name}")[0] == pytest.approx(0.5, abs=0.02), "it is turned to the front"
 
 
+def test_long_labels_of_pins_stay_in_a_narrow_picture(browser: Browser, kept: Kept) -> None:
+    with opened(browser, kept.at("fitting"), viewport={"width": 360, "height": 740}) as page:
+        for x, y in ((0.3, 0.3), (0.7, 0.4), (0.5, 0.7)):
+            page.get_by_label("sets a pin").check()
+            with page.expect_response(lambda answer: answer.request.method == "PATCH"):
+                click(page, x, y)
+                page.get_by_label("Label of the new pin").fill(f"a mole that was seen at {x}, {y}, to be looked at")
+                page.keyboard.press("Enter")
+        expect(page.locator(".pin:not([hidden])")).to_have_count(3)
+        wait_drawn(page)
+        assert layout_faults(page) == []
+
+
 def stands_at(page: Page, label: str) -> tuple[float, float]:
     """Where a pin is in the picture, as shares of its width and height."""
     box, pin = (page.locator(at).bounding_box() for at in ("#view", f".pin:has-text('{label}')"))
@@ -409,6 +422,28 @@ def cells_of(grid: Grid, points: FloatArray) -> tuple[IntArray, IntArray]:
     u = (np.arctan2(points[:, 1], points[:, 0]) - spec.theta0_rad) / (2 * np.pi)
     row = np.clip(np.rint(v * spec.height - 0.5), 0, spec.height - 1).astype(int)
     return row, np.rint(u * spec.width - 0.5).astype(int) % spec.width
+
+
+@pytest.mark.parametrize(("name", "width"), [("head", 1000), ("head", 360), ("lumpy", 1000)])
+def test_a_picture_stands_where_the_model_will(browser: Browser, kept: Kept, name: str, width: int) -> None:
+    """As long as there is no model, and as if it were that."""
+    with blank(browser, viewport={"width": width, "height": 700}) as (page, _):
+        page.route("**/assets/worker-*", lambda route: route.abort())
+        page.goto(kept.at(name))
+        expect(page.locator("#poster")).to_have_js_property("complete", True)
+        before = crop(page, 0.5, 0.5, 240, "#poster")
+        page.unroute("**/assets/worker-*")
+        page.reload()
+        page.wait_for_selector("html[data-scan]", state="attached")
+        page.wait_for_selector("#app:not(.early) aside details", state="attached")
+        wait_drawn(page)
+        expect(page.locator("#poster")).to_have_count(0)
+        assert psnr(before, crop(page, 0.5, 0.5, 240)) >= 24
+        page.goto("about:blank")
+        page.goto(kept.at(name, "1,0.2,300,0,75,0"))
+        page.wait_for_selector("html[data-scan]", state="attached")
+        asked = page.evaluate("performance.getEntriesByType('resource').map(({ name }) => name)")
+        assert not [path for path in asked if path.endswith("/picture")], "the camera is elsewhere"
 
 
 def test_colour_that_a_graphics_card_has_no_room_for_is_shown_smaller(browser: Browser, kept: Kept) -> None:

@@ -56,7 +56,7 @@ export class Marks {
 
   /** Move along with the picture. */
   update(): void {
-    for (const { pin, element } of this.pins) this.put(element, pin);
+    for (const { pin, element } of this.pins) this.turn(element, this.put(element, pin));
     this.put(this.busy, this.looked);
     const ends = this.ends.map(({ place, element }) => this.put(element, place));
     this.drawWays();
@@ -77,6 +77,15 @@ export class Marks {
       x: Math.min(Math.max(x - width / 2, 0), Math.max(widest - width, 0)),
       y: Math.min(Math.max(y - height - OVER_PX, 0), Math.max(highest - height, 0)),
     };
+  }
+
+  /** Have a pin's label stand where there is more room, beside it and above or below. */
+  private turn(element: HTMLElement, at: { x: number; y: number } | null): void {
+    if (!at) return;
+    const { clientWidth: widest, clientHeight: highest } = this.element;
+    element.classList.toggle('left', at.x > widest / 2);
+    element.classList.toggle('below', at.y < highest / 2);
+    element.style.setProperty('--room', `${Math.max(at.x, widest - at.x)}px`);
   }
 
   private drawWays(): void {
