@@ -129,6 +129,7 @@ def test_what_a_sweep_is_worth_is_said(browser: Browser, node: RunningNode) -> N
         page.route(re.compile("/v1/scans/[0-9a-f]{32}$"), corrected)
         page.reload()
         expect(axis).to_have_text("corrected by 0.80 mm sideways, -0.50 mm in range")
+        page.unroute_all(behavior="wait")  # the list's small picture asks, too
 
 
 def dragged(page: Page) -> int:
