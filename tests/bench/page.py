@@ -47,7 +47,7 @@ STEPS = """() => {
   const frame = bench.frames.find(({ scan }) => scan);
   return {
     page: page.responseEnd, 'first script run': bench.first.worker, 'graphics context': bench.first.context,
-    picture: bench.poster,
+    picture: bench.poster ?? frame.end,
     'main script there': script.responseEnd, 'first shader given': bench.first.program,
     'stream ready': bench.first.stream, 'first view decoded': bench.first.view,
     'frame begun': frame.begin, 'frame drawn': frame.end,
