@@ -9,6 +9,7 @@ node.connection, who comes in by node.pairing, who is refused by node.auth.
 from __future__ import annotations
 
 import asyncio
+from http import HTTPStatus
 from itertools import islice
 from pathlib import Path
 
@@ -47,6 +48,8 @@ class AuditRoutes:
         if event is None or not 200 <= response.status < 300:
             return
         scan = request.get(SCAN) or request.match_info.get("scan", "")
+        if event in SELDOM and response.status == HTTPStatus.NO_CONTENT:
+            return  # nothing is shown
         if event in SELDOM:
             self._audit.note_seen(event, asker(request), scan)
         else:

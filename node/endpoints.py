@@ -115,7 +115,7 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         ),
         Endpoint(
             "GET", "/v1/scans/{scan}/picture", "a picture of its first view",
-            gives={200: {"image/webp": bytes}}, event="seen",
+            gives={200: {"image/webp": bytes}, 204: None}, event="seen",
         ),
     )),
     ("view", "look at places without a stream, or by way of a cache", (

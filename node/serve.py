@@ -324,7 +324,11 @@ class NodeServer:
         return web.Response(body=body, content_type="application/octet-stream", headers=headers)
 
     async def _picture(self, request: web.Request) -> web.Response:
-        request[SCAN], picture = await self._exhibits.picture(request.match_info["scan"])
+        """Nothing where there is no such scan: a page asks before it knows, and browsers complain of any failure."""
+        try:
+            request[SCAN], picture = await self._exhibits.picture(request.match_info["scan"])
+        except LibraryError:
+            return web.Response(status=204)
         return web.Response(body=picture, content_type="image/webp")
 
     async def _sweep(self, request: web.Request) -> web.Response:
