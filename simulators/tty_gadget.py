@@ -12,7 +12,7 @@ from simulators.gadget import Gadget
 from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
 
 _APPEARS_S = 5.0
-_LOOK_S = 0.02
+_LOOK_S = 0.02  # the kernel makes the file, and udev its rights, a few of these later; nothing here is told of it
 
 
 class TtyGadget(TerminalPort):

@@ -12,17 +12,15 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from simulators.gadget import Gadget
-from simulators.pace import Pace
 from simulators.usb_descriptors import BULK_IN, BULK_OUT, UsbIdentity, bulk_endpoint, bulk_interface
+from simulators.usb_pipes import UsbPipes
 
-_WAITING_BYTES = 1 << 20
 _RETRY_S = 0.005  # nothing tells when a host takes the device up
 _DESCRIPTORS_MAGIC, _STRINGS_MAGIC = 3, 2
 SUPER_SPEED_PACKET_BYTES = 1024
@@ -32,7 +30,7 @@ _BURST = 15  # packets more, before a host of super speed answers
 T = TypeVar("T")
 
 
-class UsbGadget:
+class UsbGadget(UsbPipes):
     """A device with a bulk endpoint each way; `read` and `write` are its end.
 
     controller : which device controller it is plugged in by, as in /sys/class/udc.   rate_bytes_s : speed towards the
@@ -42,15 +40,10 @@ class UsbGadget:
     def __init__(
         self, controller: str, identity: UsbIdentity | None = None, rate_bytes_s: float = float("inf")
     ) -> None:
+        super().__init__(rate_bytes_s)
         self.identity = identity or UsbIdentity()
         self.name = self.identity.address
-        self.stalls = 0  # halts to come, each before a transfer
-        self.waited_s = 0.0  # for the node to fetch what the device has to send
-        self._pace = Pace(rate_bytes_s)
-        self._changed = threading.Condition()
-        self._out: deque[bytes] = deque()
-        self._in: deque[bytes] = deque()
-        self._is_cancelled = self._is_closed = False
+        self._is_closed = False
         self._plugged_in = 0  # how often
         self._gadget = Gadget(controller, self.identity, "ffs")
         self._folder = Path(tempfile.mkdtemp(prefix="foveascan-gadget-"))
@@ -63,31 +56,6 @@ class UsbGadget:
         self.plug_in()
         for thread in self._threads:
             thread.start()
-
-    def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        """What the node wrote, a packet at a time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._in or self._is_cancelled, max(timeout_s, 0.0))
-            self._is_cancelled = False
-            return self._in.popleft() if self._in else b""
-
-    def write(self, data: bytes) -> None:
-        """Send `data`, the last packet short; waits while the node does not fetch it, until `cancel`."""
-        if not data:
-            return
-        with self._changed:
-            began_s = time.monotonic()
-            self._changed.wait_for(lambda: sum(map(len, self._out)) < _WAITING_BYTES or self._is_cancelled)
-            self.waited_s += time.monotonic() - began_s
-            self._out.append(data)
-            self._changed.notify_all()
-        self._pace.wait(len(data))
-
-    def cancel(self) -> None:
-        """Wake who waits in read or write."""
-        with self._changed:
-            self._is_cancelled = True
-            self._changed.notify_all()
 
     def hang_up(self) -> None:
         """Pull the plug; what was on its way is lost."""
@@ -122,7 +90,7 @@ class UsbGadget:
         while not self._is_closed:
             with self._changed:
                 self._changed.wait_for(lambda: self._out or self._is_closed)
-                data = self._out.popleft() if self._out else b""
+                data = self._out.popleft() if self._out else memoryview(b"")
                 self._changed.notify_all()
             if data:
                 self._transfer(lambda: os.read(self._sink, 1), lambda: os.write(self._sink, data))  # noqa: B023

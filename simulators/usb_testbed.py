@@ -16,21 +16,19 @@ import shutil
 import socket
 import struct
 import threading
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from simulators.pace import Pace
 from simulators.usb_descriptors import BULK_IN, BULK_OUT, UsbIdentity
+from simulators.usb_pipes import UsbPipes
 from simulators.usb_uevent import announce
 
 PRELOAD = "libumockdev-preload.so.0"
 BUS_SWITCH_S = 0.00005  # for sys.setswitchinterval: the bus waits for the table's arithmetic no longer
 _HOLD_S = 0.002  # how long a reap waits for news: longer holds up writes, shorter spins
-_OUT_WAITING_BYTES = 1 << 20
 _MESSAGE = struct.Struct("<QQQ")
 _IOCTL, _DONE, _READ, _WRITE = 1, 3, 5, 6
 _MINUS_1 = (1 << 64) - 1
@@ -82,7 +80,7 @@ class _Plugged:
             self.done.append(urb)
 
 
-class UsbTestbed:
+class UsbTestbed(UsbPipes):
     """One simulated USB device under a folder, as a carrier's port: `read` and `write` are the device's end.
 
     rate_bytes_s : speed towards the node.   place : where it is plugged in, 1..7; several beds may share a root.
@@ -96,18 +94,12 @@ class UsbTestbed:
         rate_bytes_s: float = float("inf"),
         place: int = 1,
     ) -> None:
+        super().__init__(rate_bytes_s)
         self.identity = identity or UsbIdentity()
         self.name = self.identity.address
-        self.stalls = 0  # transfers that the device will refuse next
-        self.waited_s = 0.0  # for the node to fetch what the device has to send
         self._root = root
-        self._pace = Pace(rate_bytes_s)
         self._port = f"1-{place}"
         self._plugged = _Plugged(place * _NUMBERS, is_gone=True)
-        self._changed = threading.Condition()
-        self._out: deque[memoryview] = deque()
-        self._in: deque[bytes] = deque()
-        self._is_cancelled = False
         self._listener: socket.socket | None = None
         (root / "sys/class").mkdir(parents=True, exist_ok=True)
         self.plug_in()
@@ -118,31 +110,6 @@ class UsbTestbed:
         return {"LD_PRELOAD": PRELOAD, "UMOCKDEV_DIR": str(self._root)}
 
     # -- the device's end ----------------------------------------------------------------------------------------
-
-    def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        """What the node wrote, one transfer at a time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._in or self._is_cancelled, max(timeout_s, 0.0))
-            self._is_cancelled = False
-            return self._in.popleft() if self._in else b""
-
-    def write(self, data: bytes) -> None:
-        """Send `data` as packets, the last one short; waits while the node does not fetch them, until `cancel`."""
-        if not data:
-            return
-        with self._changed:
-            began_s = time.monotonic()
-            self._changed.wait_for(lambda: self._waiting_bytes() < _OUT_WAITING_BYTES or self._is_cancelled)
-            self.waited_s += time.monotonic() - began_s
-            self._out.append(memoryview(data))
-            self._fill()
-        self._pace.wait(len(data))
-
-    def cancel(self) -> None:
-        """Wake who waits in read or write."""
-        with self._changed:
-            self._is_cancelled = True
-            self._changed.notify_all()
 
     def hang_up(self) -> None:
         """Pull the plug: every pending transfer ends with ESHUTDOWN."""
@@ -179,9 +146,6 @@ class UsbTestbed:
         if self._listener is not None:
             self._listener.close()
         self._ioctls.unlink(missing_ok=True)
-
-    def _waiting_bytes(self) -> int:
-        return sum(map(len, self._out))
 
     # -- sysfs ---------------------------------------------------------------------------------------------------
 
@@ -335,6 +299,9 @@ class UsbTestbed:
             urb.status = -errno.EPIPE
         else:
             urb.actual = size
+
+    def _sent(self) -> None:
+        self._fill()
 
     def _refuses(self, plugged: _Plugged) -> bool:
         """Whether the endpoints are halted, or halt now."""

@@ -22,7 +22,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -50,6 +50,7 @@ BEGIN_S, WINDOW_S, UNPACED_WINDOW_S = 0.5, 2.0, 1.0  # of a sweep; in between th
 UNPACED_PASSES = 8
 READS = {"64 KiB": 56_000, "256 KiB": USB_PORTION_BYTES}  # what a device sends at once, to fill so much with a column
 PR_SET_TIMERSLACK = 29  # heirs have it too
+KEY = b"a key that nothing else is sealed with"
 
 
 @dataclass
@@ -76,6 +77,7 @@ def run(repeats: int) -> dict[str, Any]:
         "serial": sweeps("pty", "S", SERIAL_BYTES_S, 1, repeats),
         "usb": sweeps("usb", "M", USB_BYTES_S, PASSES, repeats),
         "unpaced": {reads: unpaced(repeats, portion) for reads, portion in READS.items()},
+        "sealed": sealed(repeats),
         "driver": {str(portion): driver(portion, repeats) for portion in (1 << 16, 1 << 18)},
         "driver_paced": driver(1 << 16, repeats, USB_BYTES_S, PACED_BYTES),
         "recovery_s": recovery(repeats),
@@ -108,6 +110,20 @@ def unpaced(repeats: int, portion_bytes: int) -> dict[str, float]:
         sweep(running, UNPACED_WINDOW_S)  # the scanner then has its columns at hand
         swept = [sweep(running, UNPACED_WINDOW_S) for _ in range(repeats)]
     return {**_medians(swept), "lost_columns": sum(sweep["lost_columns"] for sweep in swept)}
+
+
+def sealed(repeats: int) -> dict[str, Any]:
+    """Sweeps at the full speed of USB into a sealed library; or why there can be none here."""
+    from protocol.errors import LibraryError
+
+    try:
+        with line("usb", "M", USB_BYTES_S, PASSES, is_sealed=True) as running:
+            sweep(running)
+            swept = [sweep(running) for _ in range(repeats)]
+    except LibraryError as problem:
+        return {"why_not": str(problem)}
+    lost = sum(sweep["lost_columns"] for sweep in swept)
+    return {**_medians(swept), "rate_aimed_at": USB_BYTES_S, "lost_columns": lost}
 
 
 def sweep(running: Line, window_s: float = WINDOW_S) -> dict[str, Any]:
@@ -262,16 +278,28 @@ def assembly(repeats: int, *axis: str) -> dict[str, float]:
 
 @contextmanager
 def line(
-    link: str, size: str, rate_bytes_s: float, passes: int, portion_bytes: int | None = None
+    link: str, size: str, rate_bytes_s: float, passes: int, portion_bytes: int | None = None, is_sealed: bool = False
 ) -> Iterator[Line]:
-    """A scanner whose table waits for nothing but its line, and a node."""
+    """A scanner whose table waits for nothing but its line, and a node.
+
+    Raises LibraryError where its library shall be sealed and this machine cannot do that.
+    """
     path, at_once = ("usb", USB_PORTION_BYTES) if link == "usb" else ("tty", PORTION_BYTES)
     with tempfile.TemporaryDirectory(prefix="fs-") as folder, ExitStack() as stack:
         arguments = (link, f"{folder}/{path}", size, str(rate_bytes_s), "0.05", str(portion_bytes or at_once))
         said = stack.enter_context(worker("device", *arguments))
         scanner = json.loads(said.readline())
+        if is_sealed:
+            stack.enter_context(_sealed_library(Path(folder, "library")))
         process, ready = stack.enter_context(_node(folder, scanner["address"], scanner["environment"], passes))
         yield Line(ready["url"], process.pid, said)
+
+
+def _sealed_library(folder: Path) -> AbstractContextManager[Path]:
+    from node.sealed import make_sealed, opened, sealed_folder
+
+    make_sealed(sealed_folder(folder), KEY)
+    return opened(sealed_folder(folder), folder, KEY)
 
 
 @contextmanager
@@ -333,6 +361,7 @@ def told(record: dict[str, Any]) -> str:
     for reads, free in record["unpaced"].items():
         what = f"USB unpaced, whole capture, reads of {reads}"
         lines.append(f"{what}: {free['mb_s']:.0f} MB/s; {_shares(free)}; {free['lost_columns']} lost")
+    lines.append(_sealed_in_words(record["sealed"]))
     for portion, found in record["driver"].items():
         share = f"{_percent(found['core'])} of a core"
         lines.append(f"USB driver alone, unpaced, writes of {portion} bytes: {found['mb_s']:.0f} MB/s, {share}")
@@ -348,6 +377,16 @@ def told(record: dict[str, Any]) -> str:
 
 def _shares(found: dict[str, float]) -> str:
     return f"node {_percent(found['core'])}, scanner {_percent(found['scanner_core'])} of a core"
+
+
+def _sealed_in_words(found: dict[str, Any]) -> str:
+    if "why_not" in found:
+        return f"usb into a sealed library: not measured: {found['why_not']}"
+    return (
+        f"usb into a sealed library, M: {found['mb_s']:.2f} MB/s of {found['rate_aimed_at'] / MEGABYTE:.2f};"
+        f" {_shares(found)}, without gocryptfs's; {_percent(found['waiting'])} of it the scanner waited for the node;"
+        f" {found['lost_columns']} columns lost"
+    )
 
 
 def _percent(share: float) -> str:
