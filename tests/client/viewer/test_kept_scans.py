@@ -436,6 +436,7 @@ def test_a_picture_stands_where_the_model_will(browser: Browser, kept: Kept, nam
         page.reload()
         page.wait_for_selector("html[data-scan]", state="attached")
         page.wait_for_selector("#app:not(.early) aside details", state="attached")
+        page.locator(".marks").evaluate("(pins) => (pins.hidden = true)")
         wait_drawn(page)
         expect(page.locator("#poster")).to_have_count(0)
         assert psnr(before, crop(page, 0.5, 0.5, 240)) >= 24
