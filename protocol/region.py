@@ -46,7 +46,7 @@ class Region:
         return np.logical_and.outer(down, (columns - self.left) % self.turn < self.width)
 
     def blocks(self, side: int) -> tuple[int, int, int, int]:
-        """Blocks of the rectangle round it: first column, first row, columns, rows; all round when it meets itself."""
+        """Blocks of the rectangle round it: first column, first row, columns, rows; from 0 when it is all round."""
         first, wide = _columns_touched(self.left, self.width, side, self.turn)
         top, bottom = self.top // side, (self.top + self.height - 1) // side
         return first, top, wide, bottom - top + 1
@@ -115,12 +115,12 @@ def _columns_touched(left: int, width: int, side: int, turn: int) -> tuple[int, 
 
 
 def blocks_touched(left: IntArray, width: IntArray, side: int, turn: int) -> tuple[IntArray, IntArray]:
-    """The block columns that runs of columns (n,) touch: the first, how many; all from 0 where a run meets itself."""
+    """The block columns that runs of columns (n,) touch: the first, how many; all from 0 where it is all."""
     columns = -(-turn // side)
-    first, last = left % turn // side, (left + width - 1) % turn // side
-    wide = (last - first) % columns + 1
-    meets = (width > turn - side) | ((width > side) & (wide == 1))
-    return np.where(meets, 0, first), np.where(meets, columns, wide)
+    begin, end = left % turn, left % turn + width - 1
+    wraps, first = end >= turn, begin // side
+    wide = np.where(wraps, columns - first + (end - turn) // side, end // side - first) + 1
+    return np.where(wide >= columns, 0, first), np.minimum(wide, columns)
 
 
 def region_round(u: float, v: float, share: float, width: int, height: int) -> Region:

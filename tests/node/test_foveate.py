@@ -121,6 +121,15 @@ def test_everything_there_is_can_be_asked_for(
     assert viewer.range_error_mm(look) == 0
 
 
+@pytest.mark.parametrize(("u", "window"), [(0.99, 0.5959915993072378), (0, 0.5419719531578474)])
+def test_a_window_may_touch_every_block_without_being_all_round(tmp_path: Path, u: float, window: float) -> None:
+    scan = keep(make_grid(48, 32), tmp_path)  # of three blocks round, so that a run of 37 touches all
+    viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
+    look = Look(1, u, 0.5, window)
+    viewer.take(plan_update(scan, viewer.state, look, "htj2k"))
+    assert viewer.range_error_mm(look) <= look.range_mm
+
+
 @pytest.mark.parametrize("explicit", [False, True])
 def test_a_second_thread_changes_nothing(scan: Scan, view: FirstView, explicit: bool) -> None:
     look = Look(1, 0.62, 0.3, parameters=EXACT if explicit else None)
