@@ -71,9 +71,9 @@ class GridMesh:
         if not self.faces:
             raise ExchangeError("nothing is measured that spans a surface")
 
-    def bands(self) -> Iterator[Band]:
-        """Rows in bands that partition the grid."""
-        return _bands(self.grid.spec.height, self.grid.spec.width)
+    def bands(self, cells: int = BAND_CELLS) -> Iterator[Band]:
+        """Rows in bands of so many cells that partition the grid."""
+        return _bands(self.grid.spec.height, self.grid.spec.width, cells)
 
     def positions(self, band: Band) -> FloatArray:
         """Vertices of a band. (n, 3) float64 [mm]"""
@@ -238,7 +238,7 @@ def _slope(before: Float32Array, here: Float32Array, after: Float32Array, spacin
     return slope
 
 
-def _bands(rows: int, columns: int) -> Iterator[Band]:
-    height = max(1, BAND_CELLS // columns)
+def _bands(rows: int, columns: int, cells: int = BAND_CELLS) -> Iterator[Band]:
+    height = max(1, cells // columns)
     for first in range(0, rows, height):
         yield Band(first, min(first + height, rows))

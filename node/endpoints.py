@@ -26,8 +26,9 @@ Content = Mapping[str, Any]
 """A body: its media type, and the kind of record in it; bytes: what is no JSON."""
 
 FORMATS = tuple(suffix.removeprefix(".") for suffix in MEDIA_TYPES)
+_SCAN = "^(latest|[0-9a-f]{6,32})$"
 PARAMETERS: Mapping[str, Any] = {
-    "scan": Annotated[str, Meta(pattern="^(latest|[0-9a-f]{6,32})$", examples=["latest"])],
+    "scan": Annotated[str, Meta(pattern=_SCAN, examples=["latest"])],
     "sweep": Annotated[str, Meta(pattern="^[0-9a-f]{1,64}$")],
     "format": Literal[FORMATS],
     "epoch": Annotated[str, Meta(pattern="^[0-9a-f]{8}$")],
@@ -37,6 +38,11 @@ PARAMETERS: Mapping[str, Any] = {
     "scanner": Annotated[str, Meta(min_length=1, max_length=200)],
 }
 """What may stand in a path, by its name there."""
+
+
+def is_scan(text: str) -> bool:
+    """Whether that may name a scan, as "latest" does, and as an id or its beginning."""
+    return re.fullmatch(_SCAN, text) is not None
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ MODELS_MAX = 8
 PRESSING = 2  # looks that wait for each thread
 PAUSE_S = 0.02  # between two of a thousand tiles: a survey takes 20 s longer at most
 T = TypeVar("T")
-Work = Literal["look", "fovea", "view", "other"]
+Work = Literal["look", "fovea", "view", "picture", "other"]
 Key = tuple[str, CodecName, Profile]
 Opening = tuple[Scan, FirstView | ClassicView]
 
@@ -90,7 +90,7 @@ class Exhibits:
         """The id of a scan, and a picture of its first view (WebP). Raises LibraryError when there is none such."""
         key = self.library.resolve(scan_id)
         if key not in self._pictures:
-            drawn = self.work(lambda: draw_picture(self.library.open(key).coarse), "view")
+            drawn = self.work(lambda: draw_picture(self.library.open(key).coarse), "picture")
             self._pictures[key] = asyncio.ensure_future(drawn)
             while len(self._pictures) > PICTURES_MAX:
                 self._pictures.popitem(last=False)

@@ -79,7 +79,7 @@ class Metrics:
         self._registry.register(_Asked(now))
 
     def encoded(self, of: str, waited_s: float, took_s: float) -> None:
-        """A job of an encoding thread is done. of : "look", "fovea", "view" or "other"."""
+        """A job of an encoding thread is done. of : "look", "fovea", "view", "picture" or "other"."""
         self._waited.observe(waited_s)
         self._encoding.labels(of).observe(took_s)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exchange.errors import ExchangeError
-from exchange.mesh import GridMesh, Seam
+from exchange.mesh import Band, GridMesh, Seam
 from node.coarse import Coarse
 from protocol.grid import VOID, FloatArray, Grid, GridSpec, IntArray
 
@@ -23,6 +23,7 @@ HEIGHT = 480
 """Of the picture, whatever is in it. [px]"""
 FINER = 2  # drawn so much larger, so that edges are smooth
 SPLAT = 3  # a point covers so many pixels of that, squared
+POINTS = 1 << 14  # at a time
 SPACING = 2.2  # from one to the next, where they are as far away as the axis
 QUALITY = 85
 ASPECT_MIN, ASPECT_MAX = 0.2, 3.0
@@ -33,6 +34,7 @@ KEY, FILL = (np.array(light) / np.linalg.norm(light) for light in ((-0.45, 0.55,
 WRAP = 0.25  # the key light reaches round
 INSIDE = 0.65  # as bright is what is seen from within
 
+ByteArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 
@@ -43,7 +45,7 @@ def draw_picture(coarse: Coarse) -> bytes:
     aspect = min(max(2 * radius_mm / (top_mm - bottom_mm), ASPECT_MIN), ASPECT_MAX)
     distance_mm = MARGIN * (radius_mm + max((top_mm - bottom_mm) / 2, radius_mm / aspect) / half)
     height, width = FINER * HEIGHT, FINER * round(HEIGHT * aspect)
-    picture, depth_mm = np.zeros((height, width, 4), np.float32), np.full((height, width), np.inf, np.float32)
+    picture, depth_mm = np.zeros((height, width, 4), np.uint8), np.full((height, width), np.inf, np.float32)
     for points, normals, colours in _surface(coarse, (height / SPACING, math.pi * width / SPACING)):
         at = _seen_from(points - np.array([0, 0, (bottom_mm + top_mm) / 2]))
         at[:, 2] = distance_mm - at[:, 2]
@@ -85,9 +87,8 @@ def _surface(coarse: Coarse, least: tuple[float, float]) -> Iterator[tuple[Float
     except ExchangeError:  # nothing spans a surface
         return
     of_cells = np.concatenate([whole.normals(band) for band in whole.bands()]).reshape(*cells, 3)
-    normals = _stretched(of_cells, finer)
-    for band in mesh.bands():
-        here = normals[slice(*band)][measured[slice(*band)]].astype(np.float64)
+    for band in mesh.bands(POINTS):
+        here = _stretched_rows(of_cells, finer, band)[measured[slice(*band)]].astype(np.float64)
         here /= np.linalg.norm(here, axis=1, keepdims=True)
         yield mesh.positions(band), here, mesh.colours(band).astype(np.float64)
 
@@ -109,6 +110,14 @@ def _stretched(cells: Float32Array, finer: list[int]) -> Float32Array:
     return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_LINEAR)[:, across:-across], np.float32)
 
 
+def _stretched_rows(cells: Float32Array, finer: list[int], band: Band) -> Float32Array:
+    """Rows of what `_stretched` would make, of the cells they lie between."""
+    down = finer[0]
+    first = max(band.first // down - 1, 0)
+    above = first * down
+    return _stretched(cells[first : -(-band.end // down) + 1], finer)[band.first - above : band.end - above]
+
+
 def _seen_from(points: FloatArray) -> FloatArray:
     """To the right, up and towards the camera, of what lies round the place that it looks at. (n, 3)"""
     out, round_, up = points.T
@@ -117,8 +126,8 @@ def _seen_from(points: FloatArray) -> FloatArray:
 
 
 def _throw(
-    picture: Float32Array, depth_mm: Float32Array, pixels: tuple[IntArray, IntArray], away_mm: FloatArray,
-    shaded: Float32Array,
+    picture: ByteArray, depth_mm: Float32Array, pixels: tuple[IntArray, IntArray], away_mm: FloatArray,
+    shaded: ByteArray,
 ) -> None:
     """Put points into a picture where they are the nearest yet. pixels : rows, columns."""
     (height, width), (y, x) = depth_mm.shape, pixels
@@ -134,7 +143,7 @@ def _throw(
         cells[at[own] + shift] = shaded[own]
 
 
-def _lit(texels: FloatArray, normals: FloatArray, at: FloatArray) -> Float32Array:
+def _lit(texels: FloatArray, normals: FloatArray, at: FloatArray) -> ByteArray:
     """Colours as the page shades them, RGBA. normals : as the scan lies.  at : from the camera: right, up, away [mm]"""
     facing, sky = _seen_from(normals), normals[:, 2:]
     sight = at * np.array([-1, -1, 1])
@@ -148,12 +157,12 @@ def _lit(texels: FloatArray, normals: FloatArray, at: FloatArray) -> Float32Arra
     between /= np.linalg.norm(between, axis=1, keepdims=True)
     gloss = 0.018 * np.maximum(0, (facing * between).sum(axis=1, keepdims=True)) ** 24
     lit = texels / 255 * (1.1404 * np.sqrt(light) - 0.1402 * light) + gloss
-    shaded = np.full((len(at), 4), 255, np.float32)
-    shaded[:, :3] = 255 * np.clip(lit * np.where(within, INSIDE, 1), 0, 1)
+    shaded = np.full((len(at), 4), 255, np.uint8)
+    shaded[:, :3] = np.rint(255 * np.clip(lit * np.where(within, INSIDE, 1), 0, 1))
     return shaded
 
 
-def _packed(picture: Float32Array) -> bytes:
+def _packed(picture: ByteArray) -> bytes:
     """WebP of an RGBA picture that is black where it is transparent, made smaller."""
     small = np.asarray(cv2.resize(picture, None, fx=1 / FINER, fy=1 / FINER, interpolation=cv2.INTER_AREA), np.float32)
     small[..., :3] *= np.float32(255) / np.maximum(small[..., 3:], np.float32(1))

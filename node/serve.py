@@ -25,7 +25,7 @@ from node.config import Config
 from node.connection import Connection, House
 from node.derive import Derivation
 from node.durable import NoRoom
-from node.endpoints import place_of, route
+from node.endpoints import is_scan, place_of, route
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
 from node.first_view import scan_info
@@ -325,9 +325,12 @@ class NodeServer:
 
     async def _picture(self, request: web.Request) -> web.Response:
         """Nothing where there is no such scan: a page asks before it knows, and browsers complain of any failure."""
+        scan = request.match_info["scan"]
         try:
-            request[SCAN], picture = await self._exhibits.picture(request.match_info["scan"])
-        except LibraryError:
+            request[SCAN], picture = await self._exhibits.picture(scan)
+        except LibraryError as error:
+            if has_died(error) or not is_scan(scan):
+                raise
             return web.Response(status=204)
         return web.Response(body=picture, content_type="image/webp")
 

@@ -85,6 +85,7 @@ async def test_a_monitor_sees_health_and_numbers_and_nothing_else(node: Entrance
 
 async def test_jobs_that_wait_for_a_thread_are_the_queue(node: Entrance) -> None:
     exhibits, release = node.server._exhibits, asyncio.Event()
+    await exhibits.picture("latest")  # begun at the node's start
     loop = asyncio.get_running_loop()
     jobs = [
         asyncio.create_task(exhibits.work(lambda: asyncio.run_coroutine_threadsafe(release.wait(), loop).result()))

@@ -76,8 +76,8 @@ async def test_it_is_drawn_once_and_gone_with_its_scan(tmp_path: Path) -> None:
     with closing(Library(tmp_path)) as library:
         async with served(library) as (client, server):
             server._exhibits.tell(lambda of, waited_s, took_s: jobs.append(of))
-            for path in ("latest", "0" * 32):
-                assert (await client.get(f"/v1/scans/{path}/picture")).status == 204
+            for path, status in (("latest", 204), ("0" * 32, 204), ("no-scan", 404)):
+                assert (await client.get(f"/v1/scans/{path}/picture")).status == status
             scan = library.add(make_grid(160, 96), About(0.0))
             jobs.clear()
             asked = (f"/v1/scans/{of}/picture" for of in ("latest", scan.id, scan.id[:8]))
