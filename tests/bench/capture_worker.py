@@ -139,9 +139,9 @@ def read(address: str, size_bytes: str) -> None:
         port.write(b"go")
         left, began_s, cpu_s = int(size_bytes), 0.0, 0.0
         while left > 0:
-            data = port.read(1 << 20, 5)
+            data = port.read(1 << 20 if began_s else 1, 5)
             if not began_s:
-                began_s, cpu_s, left = time.monotonic(), time.process_time(), left + len(data)  # from the first on
+                began_s, cpu_s, left = time.monotonic(), time.process_time(), left + 1  # from the first byte on
             left -= len(data)
         say(seconds=time.monotonic() - began_s, cpu_s=time.process_time() - cpu_s)
 
