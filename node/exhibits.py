@@ -29,7 +29,7 @@ VIEWS_MAX = 8
 PICTURES_MAX = 64  # of some 10 KB
 GIVES_WAY = 10  # niceness of threads that compute for clients: a scanner does not wait
 MODELS_MAX = 8
-PRESSING = 2  # looks that wait for each thread
+THREADS_A_LOOK = 2  # that is given its full time
 PAUSE_S = 0.02  # between two of a thousand tiles: a survey takes 20 s longer at most
 T = TypeVar("T")
 Work = Literal["look", "fovea", "view", "picture", "other"]
@@ -50,7 +50,7 @@ class Exhibits:
         self._way = way or RightOfWay()
         self._first_view_bytes = first_view_bytes
         self._pool = ThreadPoolExecutor(workers, "encode", _give_way)
-        self._turns, self._waiting = asyncio.Semaphore(workers + 1), 0
+        self._turns, self._waiting, self._planned = asyncio.Semaphore(workers + 1), 0, 0
         self._workers = workers
         self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0
@@ -125,16 +125,19 @@ class Exhibits:
     async def turn(self) -> AsyncIterator[bool]:
         """Inside it is the caller's turn to plan a look: first come, first served, one for each thread and one more.
 
-        Whether that is pressing: so many wait that nobody would be served soon if each look were given its full time.
+        Whether that is pressing: so many are planned or wait that there are no two threads for each, as one that is
+        given its full time takes.
         """
         self._waiting += 1
         try:
             await self._turns.acquire()
         finally:
             self._waiting -= 1
+        self._planned += 1
         try:
-            yield self._waiting >= PRESSING * self._workers
+            yield self._planned + self._waiting > max(self._workers // THREADS_A_LOOK, 1)
         finally:
+            self._planned -= 1
             self._turns.release()
 
     def tell(self, encoded: Callable[[Work, float, float], object]) -> None:

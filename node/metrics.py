@@ -56,7 +56,7 @@ class Metrics:
             "foveascan_encode_wait_seconds", "Waiting for an encoding thread", buckets=ENCODE_S, registry=registry
         )
         self._hurried = Counter(
-            "foveascan_hurried_looks", "Looks planned in a hurry, since others waited", registry=registry
+            "foveascan_hurried_looks", "Looks planned in a hurry, since others were in work", registry=registry
         )
         self._updates = Counter("foveascan_updates", "Looks answered on streams", ["reason"], registry=registry)
         self._opened = Counter("foveascan_opened", "Scans opened on streams", registry=registry)

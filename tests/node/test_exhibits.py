@@ -2,13 +2,13 @@
 
 import asyncio
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import AsyncExitStack, closing
 from pathlib import Path
 
 import pytest
 
 from node.coarse import FIRST_VIEW_BYTES
-from node.exhibits import PRESSING, Exhibits
+from node.exhibits import Exhibits
 from node.library import About, Library
 from protocol.messages import Profile
 from tests.node.scans import make_grid
@@ -20,26 +20,50 @@ def exhibits(tmp_path: Path) -> Iterator[Exhibits]:
         yield exhibits
 
 
-@pytest.mark.parametrize("more", [0, 1, 2 * PRESSING, 5])
-async def test_a_turn_presses_while_many_wait_behind_it(exhibits: Exhibits, more: int) -> None:
-    begun, pressed = [], []
+@pytest.mark.parametrize("looks", [1, 2, 3, 9])
+async def test_turns_come_in_order_and_a_few_at_once(exhibits: Exhibits, looks: int) -> None:
+    begun = []
     go_on = asyncio.Event()
 
     async def plan(number: int) -> None:
-        async with exhibits.turn() as is_pressing:
+        async with exhibits.turn():
             begun.append(number)
-            pressed.append(is_pressing)
             await go_on.wait()
 
-    plans = [asyncio.create_task(plan(number)) for number in range(4 + more)]
-    while len(begun) < 3:
+    plans = [asyncio.create_task(plan(number)) for number in range(looks)]
+    while len(begun) < min(looks, 3):
         await asyncio.sleep(0)
-    assert begun == [0, 1, 2]  # two threads, and one look that is ready when either is
+    assert begun == [0, 1, 2][:looks]  # two threads, and one look that is ready when either is
     go_on.set()
     await asyncio.gather(*plans)
-    assert begun == list(range(4 + more))
-    assert pressed[3] == (more >= 2 * PRESSING)
-    assert not pressed[-1]
+    assert begun == list(range(looks))
+
+
+@pytest.mark.parametrize(("workers", "calm"), [(1, 1), (2, 1), (3, 1), (4, 2), (8, 4)])
+async def test_a_turn_presses_where_there_are_no_two_threads_for_each_look(
+    tmp_path: Path, workers: int, calm: int
+) -> None:
+    with closing(Library(tmp_path)) as library, closing(Exhibits(library, FIRST_VIEW_BYTES, workers)) as exhibits:
+        async with AsyncExitStack() as planning:
+            pressed = [await planning.enter_async_context(exhibits.turn()) for _ in range(workers + 1)]
+            assert pressed == [False] * calm + [True] * (workers + 1 - calm)
+        async with exhibits.turn() as is_pressing:
+            assert not is_pressing
+
+
+async def test_a_turn_presses_while_others_wait_behind_it(exhibits: Exhibits) -> None:
+    pressed = []
+
+    async def plan() -> None:
+        async with exhibits.turn() as is_pressing:
+            pressed.append(is_pressing)
+
+    async with exhibits.turn(), exhibits.turn(), exhibits.turn():
+        plans = [asyncio.create_task(plan()) for _ in range(2)]
+        await asyncio.sleep(0)
+        assert not pressed
+    await asyncio.gather(*plans)
+    assert pressed == [True, False]  # behind the last one nobody waits
 
 
 async def test_who_gives_up_waiting_is_not_waited_for(exhibits: Exhibits) -> None:
@@ -48,7 +72,7 @@ async def test_who_gives_up_waiting_is_not_waited_for(exhibits: Exhibits) -> Non
             raise AssertionError("nobody gave a turn")
 
     async with exhibits.turn(), exhibits.turn(), exhibits.turn():
-        waiting = [asyncio.create_task(wait()) for _ in range(2 * PRESSING + 1)]
+        waiting = [asyncio.create_task(wait()) for _ in range(3)]
         await asyncio.sleep(0)
         for one in waiting:
             one.cancel()
