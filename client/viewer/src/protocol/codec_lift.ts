@@ -21,7 +21,9 @@ export async function decodeLift(payload: Uint8Array, shapes: readonly Shape[], 
   let at = 0;
   return shapes.map(({ height, width }) => {
     const values = synthesise(misses.subarray(at, at += height * width), height, width, quantum);
-    return Uint16Array.from(values, (value) => Math.min(Math.max(value, 1), STEPS_MAX));
+    const steps = new Uint16Array(values.length);
+    for (let index = 0; index < steps.length; index++) steps[index] = Math.min(Math.max(values[index]!, 1), STEPS_MAX);
+    return steps;
   });
 }
 
@@ -49,7 +51,8 @@ function unpack(data: Uint8Array, count: number): Int32Array {
     word += 4;
   });
   if (word !== data.length) throw new RemoteWireError('range payload is too long');
-  return misses.map((value) => (value >> 1) ^ -(value & 1));
+  for (let index = 0; index < count; index++) misses[index] = (misses[index]! >> 1) ^ -(misses[index]! & 1);
+  return misses;
 }
 
 interface Step {

@@ -11,6 +11,7 @@ export type Run = [count: number, level: number, rank: number];
 const RANK_MARGIN = { [RANGE]: 1, [TEXTURE]: 3 };
 const RANK_MAX = { [RANGE]: 65534, [TEXTURE]: 256 };
 const SIDE = 8;
+const IS_LITTLE = new Uint8Array(Uint16Array.of(1).buffer)[0] === 1;
 
 /** Rank of a refinement's values: range by its quantum 1..65534, texture by its quality 0..255. */
 export function rankOf(channel: Channel, quality: number): number {
@@ -136,6 +137,7 @@ export function hashBlock(cells: Uint16Array, start: number, stride: number, wid
 
 /** The bytes of 16-bit values as they travel, on any machine. */
 export function littleEndian(values: Uint16Array): Uint8Array {
+  if (IS_LITTLE) return new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
   const bytes = new Uint8Array(2 * values.length);
   values.forEach((value, index) => {
     bytes[2 * index] = value;

@@ -194,9 +194,11 @@ function copyCells(samples: Uint8Array, y: Window, x: Window): Uint8Array {
   const patch = new Uint32Array(rows * columns);
   const nearest = (axis: Window, at: number) => (axis.part[at] === 0 ? axis.low[at]! : axis.high[at]!);
   const from = Int32Array.from({ length: columns }, (_, c) => nearest(x, c));
+  const isRun = from.every((sample, c) => sample === from[0]! + c);
   for (let r = 0; r < rows; r++) {
     const row = nearest(y, r) * x.sample.length;
-    for (let c = 0; c < columns; c++) patch[r * columns + c] = source[row + from[c]!]!;
+    if (isRun) patch.set(source.subarray(row + from[0]!, row + from[0]! + columns), r * columns);
+    else for (let c = 0; c < columns; c++) patch[r * columns + c] = source[row + from[c]!]!;
   }
   return new Uint8Array(patch.buffer);
 }
@@ -245,13 +247,28 @@ type Cells = Uint16Array | Uint32Array;
 export function paste<T extends Cells>(dense: T, rectangle: T, selection: Selection): void {
   const { lattice: { shape }, x, y } = selection;
   const [{ width }, across] = [shape, denseColumns(selection)];
-  forEachAdopted(selection, ({ row, column, height, wide }) => {
+  for (const { row, column, height, wide } of adoptedRuns(selection)) {
     const start = (((x.start * strideOf(shape) + column) % width) + width) % width;
     for (let r = row; r < row + height; r++) {
       const from = r * across + column;
       dense.set(rectangle.subarray(from, from + wide) as never, (y.start + r) * width + start);
     }
+  }
+}
+
+/** Adopted blocks beside each other as one, but not across the seam: a copy costs more to begin than to go on. */
+function adoptedRuns(selection: Selection): Omit<AdoptedBlock, 'block'>[] {
+  const { shape } = selection.lattice;
+  const runs: Omit<AdoptedBlock, 'block'>[] = [];
+  let next = -1;
+  forEachAdopted(selection, ({ row, column, height, wide, block }) => {
+    const last = runs.at(-1);
+    const goesOn = last && last.row === row && last.column + last.wide === column && block === next;
+    if (goesOn) last.wide += wide;
+    else runs.push({ row, column, height, wide });
+    next = (block + 1) % blocksAcross(shape) ? block + 1 : -1;
   });
+  return runs;
 }
 
 /** An adopted block: its place in the windows' rectangle, its flat index in the grid. */

@@ -6,6 +6,8 @@ import { h, refill } from './dom.ts';
 
 /** From a point to what is written over it. */
 const OVER_PX = 12;
+/** What takes no longer than that needs no sign that it is coming. */
+const AT_ONCE_MS = 200;
 const SVG = 'http://www.w3.org/2000/svg';
 
 /** What lies over the picture: pins, and the line of a measurement. */
@@ -21,7 +23,10 @@ export class Marks {
   private legs: Path[] = [];
   private isStraight = false;
   private pins: { pin: Pin; element: HTMLElement }[] = [];
+  /** Where detail is coming, and where that is shown. */
+  private awaited: Place | null = null;
   private looked: Place | null = null;
+  private patience: ReturnType<typeof setTimeout> | undefined;
 
   constructor(private readonly sight: Sight) {
     this.ways[1].classList.add('away');
@@ -48,10 +53,25 @@ export class Marks {
     this.update();
   }
 
-  /** Where detail is coming. */
+  /**
+   * Where detail is coming, unless it comes at once: to show that and take it away again, the browser would put the page
+   * together twice, and where a processor draws, each time takes as long as drawing the detail.
+   */
   setBusy(place: Place | null): void {
-    this.looked = place;
-    this.update();
+    this.awaited = place;
+    if (!place) {
+      clearTimeout(this.patience);
+      this.patience = undefined;
+    }
+    if (!place || this.looked) {
+      this.looked = place;
+      this.update();
+    } else {
+      this.patience ??= setTimeout(() => {
+        [this.patience, this.looked] = [undefined, this.awaited];
+        this.update();
+      }, AT_ONCE_MS);
+    }
   }
 
   /** Move along with the picture. */
