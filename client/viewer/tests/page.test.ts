@@ -206,6 +206,23 @@ test('the part of the picture that shows cells holds all of them, and little els
   assert.equal(within({ left: 60, top: 0, right: 70, bottom: 9 }, 50, 60), null);
 });
 
+test('tiles that touch what has changed are looked at again, and are then as if all were', () => {
+  const [steps, level, camera] = [alike(50), new Uint8Array(45 * 25).fill(6), fromTheSide()];
+  const [some, all] = [new Tiles(INFO, TILE), new Tiles(INFO, TILE)];
+  some.update(steps, level);
+  const seen = (tiles: Tiles) => chosen(tiles, camera, { tileSide: TILE, cellPx: 1, awayFactor: 1, trianglesMax: 1e6 });
+  const before = seen(some);
+  const changed = { x: 152, y: 96, width: 16, height: 16 };
+  for (let row = 96; row < 112; row++) {
+    steps.fill(20 / INFO.stepMm, row * INFO.width + 152, row * INFO.width + 168);
+    level.fill(0, Math.floor(row / 8) * 45 + 19, Math.floor(row / 8) * 45 + 21);
+  }
+  some.update(steps, level, changed);
+  all.update(steps, level);
+  assert.deepEqual(seen(some), seen(all));
+  assert.notDeepEqual(seen(some), before);
+});
+
 test('neighbouring tiles share every vertex of their border', () => {
   const tiles = new Tiles(INFO, TILE);
   tiles.update(alike(50), new Uint8Array(45 * 25).map((_, block) => (block % 45 < 24 ? 0 : 6)));

@@ -319,6 +319,7 @@ export function coarseToRange(coarse: Uint16Array, shape: ChannelShape): Uint16A
   const x = betweenCentres(width, coarseWidth, true);
   const y = betweenCentres(height, shape.coarseHeight, false);
   const dense = new Uint16Array(width * height);
+  const runs = runsBetween(x);
   // Of each coarse column, blended to one dense row: the weighted sum and the weight of what is measured.
   const [sum, weight] = [new Float64Array(coarseWidth), new Float64Array(coarseWidth)];
   for (let r = 0; r < height; r++) {
@@ -331,17 +332,36 @@ export function coarseToRange(coarse: Uint16Array, shape: ChannelShape): Uint16A
       sum[k] = up * above + down * below;
       weight[k] = (above && up) + (below && down);
     }
-    for (let c = 0; c < width; c++) {
-      const left = x.low[c]!;
-      const right = x.high[c]!;
-      const east = x.part[c]!;
-      if (coarse[near + (east < width ? left : right)] === 0) continue;
-      const west = 2 * width - east;
-      const whole = west * weight[left]! + east * weight[right]!;
-      dense[r * width + c] = ((2 * (west * sum[left]! + east * sum[right]!) + whole) / (2 * whole)) | 0;
+    for (const { begin, end, left, right } of runs) {
+      const first = coarse[near + left]!;
+      const last = coarse[near + right]!;
+      if (!first && !last) continue;
+      const sums = 2 * width * sum[left]!;
+      const weights = 2 * width * weight[left]!;
+      const rise = sum[right]! - sum[left]!;
+      const more = weight[right]! - weight[left]!;
+      // Where all is measured, a product instead of each quotient: half of 1 more keeps what is whole from falling below.
+      const inverse = more ? 0 : 1 / (2 * weights);
+      for (let c = begin; c < end; c++) {
+        const east = x.part[c]!;
+        if ((east < width ? first : last) === 0) continue;
+        const whole = weights + east * more;
+        const twice = 2 * (sums + east * rise) + whole;
+        dense[r * width + c] = (inverse ? (twice + 0.5) * inverse : twice / (2 * whole)) | 0;
+      }
     }
   }
   return dense;
+}
+
+/** Columns between the same two centres. */
+function runsBetween({ low, high }: Between): { begin: number; end: number; left: number; right: number }[] {
+  const runs: { begin: number; end: number; left: number; right: number }[] = [];
+  for (let begin = 0, end = 0; begin < low.length; begin = end) {
+    while (end < low.length && low[end] === low[begin] && high[end] === high[begin]) end++;
+    runs.push({ begin, end, left: low[begin]!, right: high[begin]! });
+  }
+  return runs;
 }
 
 function betweenCentres(size: number, coarse: number, cyclic: boolean): Between {

@@ -208,9 +208,9 @@ export class Surface {
       const drawn = this.thin({ x, y, width, height, cells: cells as Uint16Array });
       if (drawn.cells.length) this.upload(integers(drawn), this.range, drawn.x, drawn.y);
       this.normals.change({ x, y, width, height });
+      this.tiles.update(this.steps, level, { x, y, width, height });
     }
     this.closePoles();
-    this.tiles.update(this.steps, level);
   }
 
   /** The samples of a rectangle that are drawn, and where they lie in the texture. */
@@ -247,6 +247,7 @@ export class Surface {
 
   /** The poles of a sphere stand as far out as the row next to them does in the mean. */
   private closePoles(): void {
+    if (!isSphere(this.info)) return;
     const { width, height } = this.info;
     const poles = [0, height - 1].map((row) => {
       const measured = this.steps.subarray(row * width, (row + 1) * width).filter((step) => step > 0);

@@ -32,6 +32,14 @@ interface Tile {
   finest: number;
 }
 
+/** Rows and columns of the grid. */
+interface Cells {
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+}
+
 /** Instances of one stride: tile corners, and strides of the four neighbours. */
 export interface Batch {
   corners: number[];
@@ -64,17 +72,20 @@ export class Tiles {
     return this.tiles.length;
   }
 
-  /** Look again where tiles lie and what they hold. level: of 8 x 8 blocks. */
-  update(steps: Uint16Array, level: Uint8Array): void {
+  /** Look again where tiles lie and what they hold: all, or those that touch a rectangle. level: of 8 x 8 blocks. */
+  update(steps: Uint16Array, level: Uint8Array, changed: Cells = { x: 0, y: 0, width: this.info.width, height: this.info.height }): void {
     const { width, height, stepMm, pitchMm } = this.info;
     const sphere = isSphere(this.info);
     for (const tile of this.tiles) {
       const [columns, rows] = [Math.min(this.side, width - tile.column), Math.min(this.side, height - tile.row)];
-      let [least, most] = [Infinity, 0];
+      const isBeside = tile.column >= changed.x + changed.width || tile.column + columns <= changed.x;
+      if (isBeside || tile.row >= changed.y + changed.height || tile.row + rows <= changed.y) continue;
+      let [least, most] = [0xffff, 0];
       for (let y = 0; y < rows; y += 4) {
         for (let x = 0; x < columns; x += 4) {
           const value = steps[(tile.row + y) * width + tile.column + x]!;
-          if (value) [least, most] = [Math.min(least, value), Math.max(most, value)];
+          if (value > most) most = value;
+          if (value > 0 && value < least) least = value;
         }
       }
       const radius = (most ? (least + most) / 2 : 0) * stepMm;
@@ -121,7 +132,7 @@ export class Tiles {
   }
 
   /** The finest and the coarsest stride of tiles drawn that these cells touch; [1, 1] where none is. */
-  strides({ x, y, width, height }: { x: number; y: number; width: number; height: number }): [number, number] {
+  strides({ x, y, width, height }: Cells): [number, number] {
     const drawn: number[] = [];
     for (let row = Math.max(0, Math.floor(y / this.side)); row < Math.min(this.down, Math.ceil((y + height) / this.side)); row++) {
       for (let column = Math.floor(x / this.side); column < Math.ceil((x + width) / this.side); column++) {
@@ -176,7 +187,7 @@ export class Tiles {
     const across = Math.ceil(this.info.width / BLOCK);
     let least = Infinity;
     for (let y = tile.row / BLOCK; y < (tile.row + rows) / BLOCK; y++) {
-      for (let x = tile.column / BLOCK; x < (tile.column + columns) / BLOCK; x++) least = Math.min(least, level[y * across + x]!);
+      for (let x = tile.column / BLOCK; x < (tile.column + columns) / BLOCK; x++) if (level[y * across + x]! < least) least = level[y * across + x]!;
     }
     return Math.max(this.thinned, 2 ** Math.floor(least / 2 - 1));
   }
