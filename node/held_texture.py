@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from node.coded import Coded
 from node.state import ClientState
@@ -113,26 +111,15 @@ def _place(blocks: tuple[int, ...], region: Region) -> tuple[IntArray, IntArray]
 def _values_inside(shape: ChannelShape, region: Region) -> tuple[FloatArray, FloatArray]:
     """How many of each block's values lie in a region, and how many it has; on a sphere those of the equator's size."""
     left, top, wide, high = region.blocks(TEXTURE_BLOCK)
-    turn, columns = divmod(left + np.arange(wide), shape.blocks[1])
-    starts = turn * shape.width + columns * TEXTURE_BLOCK  # not wrapped
+    columns = (left + np.arange(wide)) % shape.blocks[1]
     sizes = np.minimum(TEXTURE_BLOCK, shape.width - columns * TEXTURE_BLOCK)
     tops = (top + np.arange(high)) * TEXTURE_BLOCK
     heights = np.minimum(TEXTURE_BLOCK, shape.height - tops)
-    rows = np.arange(tops[0], tops[-1] + heights[-1])
-    across = np.arange(starts[0], starts[-1] + sizes[-1])
+    narrow = np.ones((1, 1))
     if shape.sphere:
-        counts = _sums(_sums(region.inside(rows, across), starts - starts[0], 1), tops - tops[0], 0)
         narrow = np.sin(np.pi * (tops + heights / 2) / shape.height)[:, None]
-    else:
-        wide_inside = _sums(region.inside(np.array([region.top]), across)[0], starts - starts[0], 0)
-        high_inside = _sums((rows < region.top + region.height) & (rows >= region.top), tops - tops[0], 0)
-        counts, narrow = np.multiply.outer(high_inside, wide_inside), np.ones((1, 1))
+    counts = region.counts(TEXTURE_BLOCK)
     inside, whole = (np.asarray(3.0 * narrow * values) for values in (counts, np.multiply.outer(heights, sizes)))
     for values in (inside, whole):
         values.flags.writeable = False
     return inside, whole
-
-
-def _sums(values: NDArray[Any], starts: IntArray, axis: int) -> IntArray:
-    """Sums of runs along an axis."""
-    return np.asarray(np.add.reduceat(values, starts, axis=axis, dtype=np.int64))

@@ -47,7 +47,9 @@ def reach_range(
     """
     held = state.holdings.channels[Channel.RANGE]
     rank, touched = _of_region(held.rank, region), region.touched(RANGE_BLOCK)
-    good = touched & (rank > COARSE_RANK) & (state.cells_beyond(target_steps, region) <= FEW_CELLS)
+    good = touched & (rank > COARSE_RANK)
+    if good.any():  # counting takes as long as interpolating, and most windows are new
+        good &= state.cells_beyond(target_steps, region) <= FEW_CELLS
     better = touched & (rank > range_rank(wanted.quantum))
     apart = good | better if better.any() or good[touched].mean() >= LISTED_SHARE else np.zeros_like(good)
     apart |= ~touched
@@ -136,9 +138,12 @@ def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:
 def _allowed_beyond(scan: Scan, region: Region) -> float:
     """How many measured cells of a region may be further off than its target, by area (99th percentile, "higher")."""
     rows = np.arange(region.top, region.top + region.height)
-    inside = region.inside(rows, np.arange(scan.spec.width))
-    measured = np.count_nonzero(inside & (scan.range_steps[region.rows] != VOID), axis=1)
-    return max(float(measured @ region.sample_area(rows)) - 1, 0) * (100 - PERCENTILE) / 100
+    void = scan.range_steps[region.rows].take(region.columns, axis=1) == VOID
+    area = region.area
+    if void.any():
+        inside = region.inside(rows, np.arange(region.left, region.left + region.width))
+        area -= float(np.count_nonzero(inside & void, axis=1) @ region.sample_area(rows))
+    return max(area - 1, 0) * (100 - PERCENTILE) / 100
 
 
 def _block_area(region: Region) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -15,7 +15,7 @@ from node.library import Scan
 from node.sample import texture_samples
 from node.state import ClientState
 from node.texture_model import SPACINGS
-from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_texture
+from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_textures
 from protocol.grid import TEXTURE_BLOCK, ImageArray
 from protocol.holdings import ChannelHoldings, texture_rank
 from protocol.lattice import Channel, Lattice, Parameters
@@ -25,6 +25,7 @@ from protocol.region import Region
 from protocol.strips import Strips, build_strips, image_shape, join_parts, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
+BAND_ROWS = 4 * TEXTURE_BLOCK  # of a sphere whose texels count as equally wide
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -42,7 +43,7 @@ def choose_spacing(scan: Scan, state: ClientState, region: Region, target_db: fl
         total, count = 0.0, 0.0
         for selection in (strip.selection for strip in strips):
             patch = texture_patch(selection, texture_samples(scan, selection))
-            error, values = _patch_error(scan, selection, region, patch)
+            error, values = Compared(scan, selection, region).error(patch)
             total, count = total + error, count + values
         if strips and total <= allowed * count:
             return p
@@ -76,7 +77,9 @@ def code_texture_lattice(
 ) -> Coded | None:
     """The same for a lattice that is given, at this quality: blocks that are held at a better one stay as they are."""
     strips = select_texture_lattice(state, parameters, quality)
-    return code_texture_strips(scan, strips, quality, codec, quick=quick) if strips else None
+    if not strips:
+        return None
+    return code_texture_strips(strips, texture_images(scan, strips, codec), quality, codec, quick=quick)
 
 
 def select_texture_lattice(state: ClientState, parameters: Parameters, quality: float) -> Strips:
@@ -85,16 +88,21 @@ def select_texture_lattice(state: ClientState, parameters: Parameters, quality: 
     return select_strips(build_strips(held.shape, parameters), held, texture_rank(int(quality)))
 
 
-def code_texture_strips(scan: Scan, strips: Strips, quality: float, codec: TextureCodec, *, quick: bool) -> Coded:
-    """Encode what was selected."""
-    images = (_image(scan, strip.selection, codec) for strip in strips)
-    payloads = [encode_texture(image, codec, quality, quick=quick) for image in images]
+def code_texture_strips(
+    strips: Strips, images: Sequence[ImageArray], quality: float, codec: TextureCodec, *, quick: bool
+) -> Coded:
+    """Encode what was selected, as it travels."""
+    payloads = encode_textures(images, codec, quality, quick=quick)
     parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
     return Coded(parts, texture_rank(int(quality)), quality, codec, join_parts(payloads))
 
 
+def texture_images(scan: Scan, strips: Strips, codec: TextureCodec) -> list[ImageArray]:
+    """The texels of each strip as they travel, whatever the quality."""
+    return [_image(scan, strip.selection, codec) for strip in strips]
+
+
 def _image(scan: Scan, selection: Selection, codec: TextureCodec) -> ImageArray:
-    """The texels of a strip as they travel."""
     texels = texture_samples(scan, selection)
     more = image_shape(selection, codec)[0] - len(texels)
     return np.concatenate([texels, texels[-1:]]) if more else texels
@@ -155,30 +163,22 @@ def _measured(part: Part, coded: Coded) -> Part:
     return replace(part, patch=texture_patch(selection, image[: selection.sample_shape[0]]))
 
 
-def adopted_error(scan: Scan, coded: Coded, region: Region) -> tuple[float, float]:
-    """Squared error that a measured refinement leaves in a region's adopted own texels, and of how many values.
+class Compared:
+    """What a strip's patches are held against: the texture at its adopted own texels in a region."""
 
-    On a sphere a value counts for the area it has, 1 on the equator.
-    """
-    total, count = 0.0, 0.0
-    for part in coded.parts:
-        if part.patch is not None:
-            error, values = _patch_error(scan, part.selection, region, part.patch)
-            total, count = total + error, count + values
-    return total, count
+    def __init__(self, scan: Scan, selection: Selection, region: Region) -> None:
+        wanted = selection.adopted_cells() & own_inside(region, selection)
+        self._own = slice(0, wanted.shape[1])
+        self._truth = np.ascontiguousarray(np.asarray(cut(scan.texture, selection))[:, self._own])
+        self._wanted, self._bands = wanted.view(np.uint8), tuple(_bands(selection))
+        self._values = sum(area * 3 * cv2.countNonZero(self._wanted[rows]) for rows, area in self._bands)
 
-
-def _patch_error(scan: Scan, selection: Selection, region: Region, patch: ImageArray) -> tuple[float, float]:
-    """The same of one strip's patch."""
-    wanted = (selection.adopted_cells() & own_inside(region, selection)).view(np.uint8)
-    own = slice(0, wanted.shape[1])
-    truth = np.ascontiguousarray(np.asarray(cut(scan.texture, selection))[:, own])
-    patch = np.ascontiguousarray(patch[:, own])
-    total = count = 0.0
-    for rows, area in _bands(selection):
-        total += area * cv2.norm(patch[rows], truth[rows], cv2.NORM_L2SQR, wanted[rows])
-        count += area * 3 * cv2.countNonZero(wanted[rows])
-    return total, count
+    def error(self, patch: ImageArray) -> tuple[float, float]:
+        """Squared error of a patch there, and of how many values. On a sphere a value counts for the area it has, 1 on
+        the equator."""
+        patch, truth, wanted = np.ascontiguousarray(patch[:, self._own]), self._truth, self._wanted
+        norms = (area * cv2.norm(patch[rows], truth[rows], cv2.NORM_L2SQR, wanted[rows]) for rows, area in self._bands)
+        return sum(norms), self._values
 
 
 def _bands(selection: Selection) -> Iterator[tuple[slice, float]]:
@@ -187,8 +187,8 @@ def _bands(selection: Selection) -> Iterator[tuple[slice, float]]:
     if not shape.sphere:
         yield slice(0, rows), 1.0
         return
-    for top in range(0, rows, TEXTURE_BLOCK):
-        bottom = min(top + TEXTURE_BLOCK, rows)
+    for top in range(0, rows, BAND_ROWS):
+        bottom = min(top + BAND_ROWS, rows)
         yield slice(top, bottom), shape.stride * math.sin(math.pi * (first + (top + bottom) / 2) / shape.height)
 
 

@@ -21,19 +21,20 @@ from node.library import Scan
 from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
     CODECS,
-    adopted_error,
+    Compared,
     choose_spacing,
     code_texture_strips,
     measured,
     mse_of_db,
     quality_bounds,
     select_texture_lattice,
+    texture_images,
     texture_lattice,
 )
 from node.state import ClientState
 from node.texture_model import SPACINGS, Expected, Place, TextureModel
 from protocol.codec import LOSSLESS, SIXTEENTHS
-from protocol.grid import TEXTURE_BLOCK, BoolArray
+from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray
 from protocol.lattice import Channel, Parameters, runs_to_mask
 from protocol.messages import CodecName, Look, TextureParameters
 from protocol.region import Region
@@ -90,6 +91,8 @@ class TextureSearch:
         self._known: dict[tuple[int, tuple[int, ...] | None], Expected] = {}
         self._least: dict[tuple[int, tuple[int, ...] | None], int] = {}
         self._tried: dict[tuple[int, float, Carried], Coded] = {}
+        self._images: dict[tuple[int, Carried], list[ImageArray]] = {}
+        self._compared: dict[tuple[int, Carried], list[Compared]] = {}
         self.limited = False
         self.mse: float | None = None
 
@@ -285,11 +288,14 @@ class TextureSearch:
         strips = select_texture_lattice(self._state, parameters, quality)
         if not strips:
             return None
-        earlier = self._tried.get((p, quality, _carried(strips)))
+        carried, codec = _carried(strips), CODECS[self._codec]
+        earlier = self._tried.get((p, quality, carried))
         if earlier is not None:
             return _of_strips(earlier, strips)
         self._encodes.add()
-        return code_texture_strips(self._scan, strips, quality, CODECS[self._codec], quick=self._quick)
+        if (p, carried) not in self._images:
+            self._images[p, carried] = texture_images(self._scan, strips, codec)
+        return code_texture_strips(strips, self._images[p, carried], quality, codec, quick=self._quick)
 
     def _lattice(self, p: int) -> Parameters:
         """Of the whole window at a spacing."""
@@ -316,9 +322,19 @@ class TextureSearch:
         """Squared error per value that a refinement (or none) leaves in the window, what is held there included."""
         total, count = 0.0, 0.0
         if coded is not None:
-            total, count = adopted_error(self._scan, coded, self._region)
+            for compared, part in zip(self._held_against(coded), coded.parts, strict=True):
+                assert part.patch is not None  # measured before
+                error, values = compared.error(part.patch)
+                total, count = total + error, count + values
         held_total, held_count = self._held.error(self._held.left_alone(coded), most=coded is not None)
         return (total + held_total) / max(count + held_count, 1)
+
+    def _held_against(self, coded: Coded) -> list[Compared]:
+        """What its patches are compared with, of each part."""
+        key = coded.parameters.half_spacing, _carried(coded.strips)
+        if key not in self._compared:
+            self._compared[key] = [Compared(self._scan, strip.selection, self._region) for strip in coded.strips]
+        return self._compared[key]
 
     def _sent(self, coded: Coded) -> BoolArray:
         """Which of the window's blocks a refinement changes."""

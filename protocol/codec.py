@@ -64,6 +64,21 @@ def encode_texture(image: ImageArray, codec: TextureCodec, quality: float, *, qu
     return codec_htj2k.encode(image, LOSSLESS) if quality == LOSSLESS else codec_colours.encode(image, quality)
 
 
+def encode_textures(
+    images: Sequence[ImageArray], codec: TextureCodec, quality: float, *, quick: bool = False
+) -> list[bytes]:
+    """A payload of each of several images of one texture, as of encode_texture.
+
+    Lossy HTJ2K's colours are turned as suits the largest one, which takes less time than to look at each.
+    """
+    if codec == TextureCodec.JPEG or quality == LOSSLESS or len(images) < 2:
+        return [encode_texture(image, codec, quality, quick=quick) for image in images]
+    for image in images:
+        _check_array(image, np.uint8, 3)
+    turn = codec_colours.turn_of(max(images, key=lambda image: image.size))
+    return [codec_colours.encode(image, quality, turn) for image in images]
+
+
 def decode_texture(payload: bytes, codec: TextureCodec, quality: int, shape: tuple[int, int]) -> ImageArray:
     """(h, w, 3) uint8 RGB of a payload, shape = (h, w), quality its whole steps. Raises CodecError."""
     _check_payload(payload, shape, 3)

@@ -28,6 +28,7 @@ _UNIT = 127  # of a quaternion's numbers
 _SCALE = codec_htj2k.LEVEL / math.sqrt(3)  # of turned colours: with it the first axis of a grey image is its mean
 _MIDDLE = 1 << 15
 _GREY = 128
+Turn = tuple[int, ...]
 _EVERY = 2  # of an image's rows, with the one below: as many tell its axes, of a large one ...
 _TEXELS = 1 << 16  # ... so many texels
 # Colours of Y Cb Cr, and back (ISO/IEC 15444-1 G.3).
@@ -35,13 +36,14 @@ _FROM_YCC = np.array([[1, 0, 1.402], [1, -0.114 * 1.772 / 0.587, -0.299 * 1.402 
 _TO_YCC: FloatArray = np.linalg.inv(_FROM_YCC)
 
 
-def encode(image: ImageArray, quality: float) -> bytes:
+def encode(image: ImageArray, quality: float, turn: Turn | None = None) -> bytes:
     """Payload of an (h, w, 3) uint8 RGB image.
 
     quality : 0..LOSSY_MAX in sixteenths, step 2**(-quality/8). Raises CodecError for any other.
+    turn : of its colours, as of turn_of; None: the image's own.
     """
     whole, sixteenths = divmod(round(quality * SIXTEENTHS), SIXTEENTHS)
-    turn = _turn_of(image)
+    turn = turn_of(image) if turn is None else turn
     matrix = _SCALE * _FROM_YCC @ _axes(turn)
     offset = _MIDDLE - matrix @ np.full(3, _GREY)
     turned = cv2.transform(image.astype(np.uint16), np.column_stack([matrix, offset]))
@@ -65,7 +67,7 @@ def restore(payload: bytes, shape: tuple[int, int], quality: int) -> bytes:
     return codec_htj2k.restore(payload[_PREFIX.size :], (*shape, 3), quality + sixteenths / SIXTEENTHS)
 
 
-def _read_prefix(payload: bytes) -> tuple[int, tuple[int, ...]]:
+def _read_prefix(payload: bytes) -> tuple[int, Turn]:
     if len(payload) < _PREFIX.size:
         raise CodecError("texture payload is cut short")
     sixteenths, *turn = _PREFIX.unpack_from(payload)
@@ -74,7 +76,7 @@ def _read_prefix(payload: bytes) -> tuple[int, tuple[int, ...]]:
     return sixteenths, tuple(turn)
 
 
-def _turn_of(image: ImageArray) -> tuple[int, ...]:
+def turn_of(image: ImageArray) -> Turn:
     """The axes along which neighbouring texels of an (h, w, 3) uint8 image differ most and least. In 127ths."""
     every = max(image.shape[0] * image.shape[1] // _TEXELS, _EVERY)
     rows, below = np.ascontiguousarray(image[:-1:every]), np.ascontiguousarray(image[1::every])
@@ -102,7 +104,7 @@ def _quaternion(m: FloatArray) -> FloatArray:
     return np.asarray(vectors[:, -1])
 
 
-def _axes(turn: tuple[int, ...]) -> FloatArray:
+def _axes(turn: Turn) -> FloatArray:
     """The rotation matrix of a quaternion of any length."""
     w, x, y, z = np.array(turn, np.float64) / math.hypot(*turn)
     return np.array([

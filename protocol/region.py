@@ -45,6 +45,15 @@ class Region:
         down = (rows >= self.top) & (rows < self.top + self.height)
         return np.logical_and.outer(down, (columns - self.left) % self.turn < self.width)
 
+    def counts(self, side: int) -> IntArray:
+        """How many of its samples lie in each block of `blocks`. (rows, columns) int64"""
+        first, top, wide, high = self.blocks(side)
+        edges = _edges(first, wide, side, self.turn)
+        rows = np.diff(np.clip(side * np.arange(top, top + high + 1), self.top, self.top + self.height))
+        once = np.zeros(1, np.int64)
+        columns = _run_counts(once, once + self.left, once + self.width, (1, edges), self.turn)
+        return np.asarray(np.multiply.outer(rows, columns[0]))
+
     def blocks(self, side: int) -> tuple[int, int, int, int]:
         """Blocks of the rectangle round it: first column, first row, columns, rows; from 0 when it is all round."""
         first, wide = _columns_touched(self.left, self.width, side, self.turn)
@@ -91,21 +100,50 @@ class Cap(Region):
         inside = np.repeat(np.arange(lengths.size) % (2 * turns.size + 1) % 2 == 1, lengths)
         return np.asarray(inside.reshape(rows.size, columns.size))
 
+    def counts(self, side: int) -> IntArray:
+        """How many of its samples lie in each block of `blocks`. (rows, columns) int64, read-only"""
+        if side not in self._counts:
+            first, top, wide, high = self.blocks(side)
+            row = np.arange(self.top, self.top + self.height) // side - top
+            edges = _edges(first, wide, side, self.turn)
+            counts = _run_counts(row, self.row_left, self.row_width, (high, edges), self.turn)
+            counts.flags.writeable = False
+            self._counts[side] = counts
+        return self._counts[side]
+
     def touched(self, side: int) -> BoolArray:
         """Which blocks of that rectangle it touches. (rows, columns) bool"""
-        if side not in self._touched:
-            left, top, wide, high = self.blocks(side)
-            first, count = blocks_touched(self.row_left, self.row_width, side, self.turn)
-            columns = -(-self.turn // side)
-            crosses = (left + np.arange(wide) - first[:, None]) % columns < count[:, None]
-            starts = np.maximum(side * (top + np.arange(high)) - self.top, 0)
-            self._touched[side] = np.asarray(np.logical_or.reduceat(crosses, starts, axis=0))
-            self._touched[side].flags.writeable = False
-        return self._touched[side]
+        return np.asarray(self.counts(side) > 0)
 
     @cached_property
-    def _touched(self) -> dict[int, BoolArray]:
+    def _counts(self) -> dict[int, IntArray]:
         return {}
+
+
+def _edges(first: int, wide: int, side: int, turn: int) -> IntArray:
+    """Where block columns begin, and where the last one ends, not wrapped. (wide + 1,)"""
+    turns, column = divmod(first + np.arange(wide + 1), -(-turn // side))
+    return turns * turn + column * side
+
+
+def _run_counts(
+    row: IntArray, left: IntArray, width: IntArray, blocks: tuple[int, IntArray], turn: int
+) -> IntArray:
+    """How many columns of runs (n,), cyclic, lie in each block: of a row of blocks each, and between these edges.
+
+    Counted by where runs begin and end, so that it takes as long as there are runs. (rows of blocks, edges - 1) int64
+    """
+    high, edges = blocks
+    sizes, wide = np.diff(edges), edges.size - 1
+    begin = edges[0] - (edges[0] - left) % turn  # of the run round the first edge, or left of it
+    turns = turn * np.arange((int(edges[-1]) - int(begin.min())) // turn + 1)[:, None]
+    ends = np.clip(np.concatenate([begin + turns, begin + turns + width]), edges[0], edges[-1]).ravel()
+    block = np.minimum(np.searchsorted(edges, ends, side="right") - 1, wide - 1)
+    sign = np.repeat([1, -1], ends.size // 2)
+    row = np.tile(row, ends.size // row.size)
+    part = np.bincount(row * wide + block, sign * (edges[block + 1] - ends), high * wide).reshape(high, wide)
+    behind = np.bincount(row * (wide + 1) + block + 1, sign, high * (wide + 1)).reshape(high, wide + 1)
+    return np.asarray(part + behind[:, :wide].cumsum(axis=1) * sizes, np.int64)
 
 
 @lru_cache(maxsize=256)

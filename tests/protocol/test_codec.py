@@ -260,6 +260,18 @@ def test_a_quality_between_two_whole_ones_lies_between_them() -> None:
     assert sorted(db) == db and sorted(payloads, key=len) == payloads
 
 
+def test_images_of_one_texture_are_turned_as_suits_the_largest() -> None:
+    images = [texture((40, 64)), texture((64, 96)), texture((24, 32))]
+    payloads = codec.encode_textures(images, TextureCodec.HTJ2K, 45.5)
+    assert [payload[:5] for payload in payloads] == [payloads[1][:5]] * 3
+    assert payloads[1] == codec.encode_texture(images[1], TextureCodec.HTJ2K, 45.5)
+    for image, payload in zip(images, payloads, strict=True):
+        decoded = codec.decode_texture(payload, TextureCodec.HTJ2K, 45, (image.shape[0], image.shape[1]))
+        assert cv2.PSNR(image, decoded) > 40
+    exact = codec.encode_textures(images, TextureCodec.HTJ2K, codec.LOSSLESS)
+    assert exact == [codec.encode_texture(image, TextureCodec.HTJ2K, codec.LOSSLESS) for image in images]
+
+
 @pytest.mark.parametrize("prefix", [b"\x10\x7f\0\0\0", b"\xff\x7f\0\0\0", b"\0\0\0\0\0"])
 def test_more_than_sixteenths_and_no_turn_are_refused(prefix: bytes) -> None:
     payload = codec.encode_texture(texture((33, 40)), TextureCodec.HTJ2K, 45)
