@@ -183,7 +183,8 @@ void main() {
   vec3 along = normalize(packed.rgb / packed.a * 2.0 - 1.0);
   vec3 normal = along.x * at.outward + along.y * at.round + along.z * at.up;
   vec3 view = normalize(cameraPosition - vWorld);
-  bool inside = !gl_FrontFacing;
+  // Slivers round a pole may face any way while little of it is known: there the normal tells better.
+  bool inside = !gl_FrontFacing && dot(normal, view) < 0.0;
   if (inside) normal = -normal;
 
   vec4 coarse = textureLod(uCoarse, at.uv, 0.0);
