@@ -27,6 +27,7 @@ class BackgroundWriter:
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
         self._unsafe = False  # something was written and is not durable yet
+        self._appending = False
         self._closing = False
         self._failure: OSError | None = None
         self._synced_s = time.monotonic()
@@ -43,14 +44,27 @@ class BackgroundWriter:
             if len(self._waiting) == 1 or self._waiting_bytes >= GATHER_BYTES:
                 self._changed.notify_all()
 
-    def close(self) -> None:
-        """Make everything durable and let go of the file. Raises OSError once it is let go of."""
+    def close(self, patience_s: float | None = None) -> None:
+        """Make everything durable and let go of the file. Raises OSError where it could not be written.
+
+        patience_s : after so long, what waits for a disk that takes its time is handed to the system, which a power cut
+        alone keeps from writing it; it becomes durable when the disk gets to it.
+        """
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join()
-        os.close(self._file)
+        self._thread.join(patience_s)
+        if self._thread.is_alive():
+            self._hand_over()
         self._raise_failure()
+
+    def _hand_over(self) -> None:
+        """Write what the thread, which waits for the disk, has not begun."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._appending)
+            while self._waiting:
+                _append(self._file, self._waiting.popleft())
+                self._unsafe = True
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
@@ -66,7 +80,11 @@ class BackgroundWriter:
             with self._changed:
                 self._failure = error
                 self._waiting.clear()
+                self._appending = False
                 self._changed.notify_all()
+        finally:
+            with self._changed:
+                os.close(self._file)
 
     def _next_batch(self) -> list[bytes] | None:
         """Everything that waits; [] when it is only time to sync; None at the end."""
@@ -79,15 +97,21 @@ class BackgroundWriter:
             batch = list(self._waiting)
             self._waiting.clear()
             self._waiting_bytes = 0
+            self._appending = True
             self._changed.notify_all()
             return batch
 
     def _done(self, wrote: bool) -> None:
         """A batch is written: make it durable when that is due."""
-        self._unsafe |= wrote
-        if self._unsafe and (self._closing or time.monotonic() >= self._synced_s + SYNC_S):
+        with self._changed:
+            self._appending = False
+            self._changed.notify_all()
+            self._unsafe |= wrote
+            is_due = self._unsafe and (self._closing or time.monotonic() >= self._synced_s + SYNC_S)
+            self._unsafe &= not is_due
+        if is_due:
             os.fdatasync(self._file)
-            self._unsafe, self._synced_s = False, time.monotonic()
+            self._synced_s = time.monotonic()
 
 
 def _append(file: int, piece: bytes) -> None:

@@ -186,10 +186,14 @@ class Capture:
         self._sweeps.get(sweep_id)
         return self._request(_Resume(sweep_id))
 
-    def stop(self, timeout_s: float = 3.0) -> None:
-        """End a running sweep and the thread."""
+    def end(self) -> None:
+        """Have a running sweep and the thread end; returns at once."""
         self._stop.set()
         self._wake()
+
+    def stop(self, timeout_s: float = 3.0) -> None:
+        """End a running sweep and the thread."""
+        self.end()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 

@@ -23,6 +23,7 @@ from node.advertise import Advertisement
 from node.assemble import Assembly
 from node.capture import Capture, Manner
 from node.config import Config
+from node.ending import CAPTURE_BY_S, Ending
 from node.exhibits import Exhibits
 from node.identity import node_identity
 from node.library import About, Library, Scan
@@ -73,7 +74,7 @@ class Node:
 
 
 async def run_node(config: Config, ready: Callable[[str], None], reread: Callable[[], Config]) -> None:
-    """Serve until SIGTERM or SIGINT; on SIGHUP, read the settings anew.
+    """Serve until SIGTERM or SIGINT; on SIGHUP, read the settings anew. The process ends with it.
 
     ready : called once with the node's URL when everything is up.  reread : the settings as they are now; may raise
     ConfigError, and then all stays as it was.
@@ -84,8 +85,9 @@ async def run_node(config: Config, ready: Callable[[str], None], reread: Callabl
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, signals.put_nowait, number)
     notifier = Notifier.from_environment(os.environ)
+    ending = Ending(of_process=True)
     async with AsyncExitStack() as stack:
-        node = await start_node(config, stack)
+        node = await start_node(config, stack, ending)
         settle()
         ready(node.url)
         notifier.ready(status_text(node.url, node.capture))
@@ -99,6 +101,7 @@ async def run_node(config: Config, ready: Callable[[str], None], reread: Callabl
             notifier.ready(status_text(node.url, node.capture))
         for task in keeping:
             task.cancel()
+        ending.begin()
         notifier.stopping()
         log.info("stopping")
 
@@ -112,8 +115,9 @@ def _reload(node: Node, reread: Callable[[], Config]) -> None:
         log.error("the settings stay as they were: %s", error)
 
 
-async def start_node(config: Config, stack: AsyncExitStack) -> Node:
-    """Bring up every part and leave its end to the stack."""
+async def start_node(config: Config, stack: AsyncExitStack, ending: Ending | None = None) -> Node:
+    """Bring up every part and leave its end to the stack. ending : the time that it may take."""
+    ending = ending or Ending()
     folder = config.library.path
     library = await asyncio.to_thread(Library, folder, config.first_view.max_bytes)
     stack.callback(library.close)
@@ -142,17 +146,23 @@ async def start_node(config: Config, stack: AsyncExitStack) -> Node:
     access, tls = await asyncio.to_thread(_entrance, config, folder, info.id)
     server = NodeServer(config, info, exhibits, live, capture, access, tls)
     host, port = await server.start()
-    stack.push_async_callback(server.stop)
+    stack.push_async_callback(server.stop, ending)
     for scan in finished:
         server.swept(scan.id)
     announce.append(lambda scan_id, sweep: loop.call_soon_threadsafe(server.swept, scan_id, sweep))
     if capture is not None:
         capture.start()
-        stack.push_async_callback(asyncio.to_thread, capture.stop)
+        stack.push_async_callback(_stop_capture, capture, ending)
     if config.discovery.enabled:
         await stack.enter_async_context(Advertisement(info.name, info.id, host, port, tls.fingerprint if tls else ""))
+    if capture is not None:
+        stack.callback(capture.end)  # first of all: while the announcement is withdrawn, its journal is closed
     scheme, address = "https" if tls else "http", f"[{host}]" if ":" in host else host
     return Node(config, f"{scheme}://{address}:{port}", server, exhibits, capture)
+
+
+async def _stop_capture(capture: Capture, ending: Ending) -> None:
+    await asyncio.to_thread(capture.stop, ending.left_s(CAPTURE_BY_S))
 
 
 def _entrance(config: Config, library: Path, node_id: str) -> tuple[Access | None, Tls | None]:

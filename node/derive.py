@@ -92,10 +92,11 @@ class Derivation:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def stop(self) -> None:
+    async def stop(self, within_s: float | None = None) -> None:
         """Leave what is not finished."""
         self._stopping.set()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=within_s)
 
     async def _close(self, scan_id: str) -> None:
         library = self._exhibits.library

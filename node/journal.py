@@ -58,6 +58,7 @@ from protocol.scanner_messages import (
 
 SUFFIX = ".sweep"
 RECORD_BYTES = 65536  # a record is written once its messages reach this
+PATIENCE_S = 1.5  # with the disk, of a sweep that was ended early: the node may be stopping
 SPARE_BYTES = 16 << 20  # what a sweep must leave free: sidecars, logs, other programs
 CUT_SHORT = "the node was cut off in the middle of it"
 COMPLETE = "it is complete, and was not published yet"
@@ -127,7 +128,10 @@ class Journal:
         self._take(end)
 
     def close(self, why: str | None = None) -> None:
-        """Make everything durable and let go of the file. why : what ended the sweep, unless it ended well."""
+        """Let go of the file, with all that was taken in it. why : what ended the sweep, unless it ended well.
+
+        Everything is durable then; but of a sweep that ended early, a slow disk may get to it later.
+        """
         if self._is_closed:
             return
         self._is_closed = True
@@ -139,7 +143,7 @@ class Journal:
         except LibraryError as error:
             failure = error
         try:
-            self._writer.close()
+            self._writer.close(PATIENCE_S if why is not None else None)
         except OSError as error:
             failure = disk_error("cannot keep the sweep", error)
         if failure is not None:

@@ -25,6 +25,7 @@ from node.config import Config
 from node.connection import Connection, House
 from node.derive import Derivation
 from node.durable import NoRoom
+from node.ending import AUDIT_BY_S, GOODBYES_BY_S, Ending
 from node.endpoints import is_scan, place_of, route
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
@@ -55,8 +56,7 @@ SEND_BUFFER_BYTES = 64 * 1024
 WRITE_LIMIT_BYTES = 16 * 1024
 HEARTBEAT_S = 20.0
 BODY_MAX_BYTES = 1 << 16
-GOODBYE_S = 1.0
-SLOW_S = 2.0  # more for those who read, and have not answered yet
+GOODBYE_S = 1.0  # then who does not read is hung up on
 ACCESS_S = 0.5  # between looks at what other processes changed of tokens and certificate
 RETAIN_S = 600.0  # between looks at what was kept long enough
 KEEP_USED_S = 300.0  # between writing down when tokens were used
@@ -87,6 +87,7 @@ class NodeServer:
         self._live = live
         self._capture = capture
         self._is_stopping = False
+        self._ending = Ending()
         self._tls = tls
         self._access = access
         self.audit = Audit(exhibits.library.folder, config.audit.bytes_max)
@@ -142,8 +143,12 @@ class NodeServer:
         self.audit.note("started", NODE, what=self._info.version)
         return host, port
 
-    async def stop(self) -> None:
-        """Tell every client, hang up on those that do not listen, then stop listening."""
+    async def stop(self, ending: Ending | None = None) -> None:
+        """Tell every client, hang up on those that do not listen, then stop listening.
+
+        ending : the time that there is, where it runs already.
+        """
+        self._ending = ending or self._ending
         self._is_stopping = True
         for task in self._watching:
             task.cancel()
@@ -151,7 +156,7 @@ class NodeServer:
         await self._gate.close()
         for line in self._connections.values():
             line.abort()
-        await self.derivation.stop()
+        await self.derivation.stop(self._ending.left_s(GOODBYES_BY_S))
         self.audit.note("stopped", NODE)
         await self._runner.cleanup()
 
@@ -161,12 +166,13 @@ class NodeServer:
         goodbyes = [asyncio.ensure_future(connection.close(*why)) for connection in self._connections]
         if not goodbyes:
             return
-        _, slow = await asyncio.wait(goodbyes, timeout=GOODBYE_S)
+        left_s = self._ending.left_s(GOODBYES_BY_S)
+        _, slow = await asyncio.wait(goodbyes, timeout=min(GOODBYE_S, left_s))
         for line in self._connections.values():
             if not line.is_closing() and line.get_write_buffer_size():
                 line.abort()
         if slow:
-            await asyncio.wait(slow, timeout=SLOW_S)
+            await asyncio.wait(slow, timeout=self._ending.left_s(GOODBYES_BY_S))
 
     async def _watch_access(self) -> None:
         """Notice what commands beside this process revoke, and certificates that were renewed or are due."""
@@ -222,10 +228,11 @@ class NodeServer:
             self._metrics.answered(request.method, place_of(request), status, size_bytes)
 
     async def _close_audit(self, app: web.Application) -> None:
-        await asyncio.to_thread(self.audit.close)
+        await asyncio.to_thread(self.audit.close, self._ending.left_s(AUDIT_BY_S))
         if self._access is not None:
-            with suppress(AccessError):  # it was said while the node ran
-                await asyncio.to_thread(self._access.keep_last_used)
+            with suppress(AccessError, TimeoutError):  # it was said while the node ran; the disk is slow
+                async with asyncio.timeout(self._ending.left_s(AUDIT_BY_S)):
+                    await asyncio.to_thread(self._access.keep_last_used)
 
     def swept(self, scan_id: str, sweep: int = 0) -> None:
         """A sweep has become a scan: note it, tell every client, and see whether it is to be a sphere, too.

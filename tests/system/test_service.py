@@ -165,6 +165,48 @@ async def test_sigterm_in_the_middle_of_a_sweep_tells_clients_and_keeps_its_colu
     assert len(list(library.sweeps.columns(kept.id))) > 10
 
 
+HANGS = """
+import os, time
+from pathlib import Path
+
+def hanging(sync):
+    def synced(file):
+        while Path({flag!r}).exists():
+            time.sleep(0.05)
+        sync(file)
+    return synced
+
+os.fsync, os.fdatasync = hanging(os.fsync), hanging(os.fdatasync)
+"""
+
+
+async def test_sigterm_while_the_disk_hangs_ends_in_time_and_keeps_every_column(tmp_path: Path) -> None:
+    """What the node could not make durable is in the system's hands: a disk that comes back has it."""
+    hung = tmp_path / "hung"
+    (tmp_path / "sitecustomize.py").write_text(HANGS.format(flag=str(hung)))
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    simulate = ["simulate", "--path", str(tmp_path / "tty"), "--link-rate", "100000", "--json"]
+    with started(*simulate) as (_, link):
+        command = serve(tmp_path, "--scanner", link["path"])
+        with started(*command, environment={"PYTHONPATH": path}) as (node, ready):
+            await ready_to_sweep(ready["url"])
+            async with connect(ready["url"]) as session:
+                await session.start_sweep()
+                news, shown = session.published(), 0.0
+                with pytest.raises(NodeLost, match="the node is stopping"):
+                    async for frame in session.live():
+                        if frame.percent > 10 and not shown:
+                            hung.touch()
+                        if frame.percent > 40 and not shown:
+                            shown = frame.percent
+                            node.terminate()
+                    await anext(news)
+                assert await asyncio.to_thread(node.wait, STOP_S) == 0
+    (kept,) = Library(tmp_path / "library").sweeps.interrupted()
+    assert 100 * kept.held >= shown * kept.expected > 0
+    assert "stop" in kept.why
+
+
 def test_the_doctor_hears_the_node(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
