@@ -38,7 +38,8 @@ from protocol.grid import VOID, BoolArray, FloatArray, Grid, GridSpec, ImageArra
 from protocol.scanner_messages import Payload
 
 COUNTS_PER_COLUMN_MIN = 2
-TURNS_KEPT = 2  # room at first; more is made as passes come
+TURNS_KEPT = 2  # room at first, where nobody said how many come
+TURNS_AT_ONCE_MAX = 8  # room at first, whatever was said; more is made as they come
 TURNS_MAX = 66
 STRIP_COLUMNS = 64
 TOLERANCE_ROWS = 0.25  # ranges that differ by less than this part of a row's height are no outliers
@@ -81,10 +82,10 @@ class Assembly:
 class Assembler:
     """Takes the columns of a sweep in any order, whole or in pieces, and makes the grid once they are all there.
 
-    Raises ValueError when the encoder is too coarse for the grid.
+    turns : how many are expected.  Raises ValueError when the encoder is too coarse for the grid.
     """
 
-    def __init__(self, spec: GridSpec, encoder: Encoder) -> None:
+    def __init__(self, spec: GridSpec, encoder: Encoder, turns: int = TURNS_KEPT) -> None:
         needed = COUNTS_PER_COLUMN_MIN * max(spec.width, spec.texture_width)
         if encoder.counts_per_turn < needed:
             raise ValueError(
@@ -92,8 +93,9 @@ class Assembler:
             )
         self._spec = spec
         self._encoder = encoder
-        steps = np.empty((TURNS_KEPT * spec.width, spec.height), np.uint16)  # memory is taken only as columns come
-        texels = np.empty((TURNS_KEPT * spec.texture_width, spec.texture_height, 3), np.uint8)
+        turns = min(turns, TURNS_AT_ONCE_MAX)
+        steps = np.empty((turns * spec.width, spec.height), np.uint16)  # memory is taken only as columns come
+        texels = np.empty((turns * spec.texture_width, spec.texture_height, 3), np.uint8)
         tolerance = TOLERANCE_ROWS * spec.pitch_mm / spec.step_mm
         self._range = _Columns("range", spec.width, steps, blend_range, tolerance)
         self._texture = _Columns("texture", spec.texture_width, texels, blend_texture, TOLERANCE_GREY)

@@ -112,7 +112,7 @@ def publish(
     deliver : returns once it is durable.  repairs, axes : as for assembled.
     Raises FoveascanError, ValueError.
     """
-    assembler = Assembler(sweep.header.spec, encoder_of(sweep.header))
+    assembler = assembler_of(sweep.header)
     for column in sweeps.columns(sweep.id):
         add_column(assembler, column)
     apart = sweep.turn is not None
@@ -134,9 +134,10 @@ def assembled(
     return replace(assembly, quality=quality, scanner=info.serial_number, settings=header.calibration)
 
 
-def encoder_of(header: SweepHeader) -> Encoder:
-    """How a sweep's encoder counts become angles."""
-    return Encoder(header.counts_per_turn, header.encoder_start, header.direction)
+def assembler_of(header: SweepHeader) -> Assembler:
+    """What takes a sweep's columns. Raises ValueError where they make no grid."""
+    encoder = Encoder(header.counts_per_turn, header.encoder_start, header.direction)
+    return Assembler(header.spec, encoder, header.passes + 1)  # one more: an overlap, or what the table overshot
 
 
 def add_column(assembler: Assembler, column: Column) -> None:

@@ -10,7 +10,7 @@ from drivers.scanner import SweepReport
 from node.assemble import Assembler, Assembly
 from node.axes import Axes
 from node.journal import Journal, Journals
-from node.resume import add_column, assembled, encoder_of
+from node.resume import add_column, assembled, assembler_of
 from node.turns import TurnStarted
 from protocol.errors import RemoteWireError, ScannerFault
 from protocol.scanner_messages import Column, DeviceInfo, Outcome, SweepEnd, SweepHeader
@@ -48,7 +48,7 @@ class RunningSweep:
     def begin(self, header: SweepHeader) -> None:
         """Make room for it. Raises ScannerFault where it fits no grid, LibraryError where it fits no disk."""
         try:
-            self._assembler = Assembler(header.spec, encoder_of(header))
+            self._assembler = assembler_of(header)
         except ValueError as error:
             raise ScannerFault(f"the scanner's sweep makes no sense: {error}") from error
         self._header = header

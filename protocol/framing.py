@@ -88,8 +88,8 @@ def encode_frame(
         head = _HEADER.pack(MAGIC, version, type, flags, 0, session, seq, len(payload), 0)[:_HEADER_CHECKED]
     except struct.error as error:
         raise LocalWireError(f"frame header: {error}") from error
-    body = b"".join((head, binascii.crc_hqx(head, _CRC16_START).to_bytes(2, "little"), payload))
-    return body + _TRAILER.pack(crc32(body))
+    head += binascii.crc_hqx(head, _CRC16_START).to_bytes(2, "little")
+    return b"".join((head, payload, _TRAILER.pack(crc32(payload, crc32(head)))))
 
 
 class FrameReader:

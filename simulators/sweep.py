@@ -42,6 +42,8 @@ class Sweep:
         self.owes_end = True
         self._table = table
         self._retention_columns = retention_columns
+        self._passes = {channel: len(header.columns_in(channel)) for channel in _COLUMN_OF}
+        self._piece_rows = {channel: header.shape(channel)[2] for channel in _COLUMN_OF}
         self._outcome = Outcome.COMPLETE
         self._waiting: deque[Exposure] = deque()
         self._again: deque[Exposure] = deque()
@@ -60,7 +62,7 @@ class Sweep:
         if not self._pieces and (self._again or self._waiting):
             exposure = (self._again or self._waiting).popleft()
             key = (exposure.channel, exposure.pass_index, exposure.column)
-            is_too_far = exposure.pass_index >= len(self.header.columns_in(exposure.channel))  # the table overshot
+            is_too_far = exposure.pass_index >= self._passes[exposure.channel]  # the table overshot
             self._is_first_time = key not in self._sent and not is_too_far
             self._sent.add(key)
             self._pieces.extend(self._cut(exposure))
@@ -120,11 +122,11 @@ class Sweep:
 
     def _cut(self, exposure: Exposure) -> Iterator[Column]:
         """The pieces of one column."""
-        samples = self._table.samples(exposure)
-        rows = self.header.shape(exposure.channel)[2]
+        samples, piece_of = self._table.samples(exposure), _COLUMN_OF[exposure.channel]
+        rows = self._piece_rows[exposure.channel]
         for row0 in range(0, len(samples), rows):
             data = samples[row0 : row0 + rows].tobytes()
-            yield _COLUMN_OF[exposure.channel](
+            yield piece_of(
                 self.header.sweep, exposure.pass_index, exposure.column, row0, exposure.encoder, exposure.time_us, data
             )
 

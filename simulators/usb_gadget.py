@@ -64,6 +64,7 @@ class UsbGadget(UsbPipes):
             self._plugged_in += 1
             self._out.clear()
             self._in.clear()
+            self._fetched()
 
     def plug_in(self) -> None:
         """Put it in again."""
@@ -91,7 +92,7 @@ class UsbGadget(UsbPipes):
             with self._changed:
                 self._changed.wait_for(lambda: self._out or self._is_closed)
                 data = self._out.popleft() if self._out else memoryview(b"")
-                self._changed.notify_all()
+                self._fetched()
             if data:
                 self._transfer(lambda: os.read(self._sink, 1), lambda: os.write(self._sink, data))  # noqa: B023
                 if len(data) % self._gadget.packet_bytes == 0:

@@ -4,8 +4,7 @@ A program started with `environment` sees one USB device: sysfs and device nodes
 come here over a Unix socket, and plugging shows as a udev event. What a carrier writes goes out as bulk packets: a read
 ends when it is full, or with a packet that is not (one of length zero if need be), as on a kernel.
 
-The preload's messages are three u64 (kind, two arguments) and data: 1 ioctl(request, address), 3 done(result, errno),
-5 read(address, size), 6 write(address, size). Source: umockdev's ioctl_tree, checked against a kernel's gadget.
+Source: umockdev's ioctl_tree, checked against a kernel's gadget.
 """
 
 from __future__ import annotations
@@ -17,24 +16,19 @@ import socket
 import struct
 import threading
 from collections import deque
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from simulators.usb_descriptors import BULK_IN, BULK_OUT, UsbIdentity
 from simulators.usb_pipes import UsbPipes
+from simulators.usb_preload import PRELOAD, PreloadClient
 from simulators.usb_uevent import announce
 
-PRELOAD = "libumockdev-preload.so.0"
 BUS_SWITCH_S = 0.00005  # for sys.setswitchinterval: the bus waits for the table's arithmetic no longer
 _HOLD_S = 0.002  # how long a reap waits for news: longer holds up writes, shorter spins
-_MESSAGE = struct.Struct("<QQQ")
-_IOCTL, _DONE, _READ, _WRITE = 1, 3, 5, 6
-_MINUS_1 = (1 << 64) - 1
-_NOT_MINE = (1 << 64) - 100  # the preload then does the real thing
 _URB = struct.Struct("<BBxxiIxxxxQiiiiIIQ")
-_STATUS_AT, _ACTUAL_AT = 4, 28
+_OUTCOME_AT, _OUTCOME = 4, struct.Struct("<iIxxxxQii")  # from its status to its actual length
 _TYPE_CONTROL = 2
 _SETUP = struct.Struct("<BBHHH")
 _CAPABILITIES = 0x1F
@@ -46,6 +40,7 @@ _CLEAR_HALT = 0x80045515
 _CLAIM, _RELEASE = 0x8004550F, 0x80045510
 _ACCEPTED = {_CLAIM, _RELEASE, _CLEAR_HALT, 0x80045505, 0x80085504, 0x5514}
 _HIGH_SPEED = 3
+_SOCKET_PATH_BYTES = 107
 _NUMBERS = 16  # devices that one place sees before their numbers meet those of the next
 
 
@@ -54,11 +49,18 @@ class _Urb:
     """A transfer that the program has handed over: where it lies in its memory, and what became of it."""
 
     address: int
+    kind: int
+    flags: int
     buffer: int
     size: int
     data: bytes | memoryview = b""
+    data_at: int = 0
     status: int = 0
     actual: int = 0
+
+    def outcome(self) -> bytes:
+        """What the program reads of it in its own memory."""
+        return _OUTCOME.pack(self.status, self.flags, self.buffer, self.size, self.actual)
 
 
 @dataclass(slots=True)
@@ -80,11 +82,22 @@ class _Plugged:
             self.done.append(urb)
 
 
+class _Program(PreloadClient):
+    """A program that has the device open.
+
+    owes : a transfer outward, whose data are still to be fetched.  has_reaped : whether it asked last for a finished
+    one, and was given it; libusb then asks for more before it does anything else.
+    """
+
+    owes: _Urb | None = None
+    has_reaped = False
+
+
 class UsbTestbed(UsbPipes):
     """One simulated USB device under a folder, as a carrier's port: `read` and `write` are the device's end.
 
     rate_bytes_s : speed towards the node.   place : where it is plugged in, 1..7; several beds may share a root.
-    Other files under `root` (udev's sockets) are left alone.
+    Other files under `root` (udev's sockets) are left alone. Raises OSError where its path is too long for sockets.
     """
 
     def __init__(
@@ -101,6 +114,9 @@ class UsbTestbed(UsbPipes):
         self._port = f"1-{place}"
         self._plugged = _Plugged(place * _NUMBERS, is_gone=True)
         self._listener: socket.socket | None = None
+        if len(os.fsencode(self._ioctls)) > _SOCKET_PATH_BYTES:
+            cure = f"a socket's path has at most {_SOCKET_PATH_BYTES} bytes, choose a shorter one"
+            raise OSError(errno.ENAMETOOLONG, cure, str(self._ioctls))
         (root / "sys/class").mkdir(parents=True, exist_ok=True)
         self.plug_in()
 
@@ -118,6 +134,7 @@ class UsbTestbed(UsbPipes):
             self._plugged.fail_pending()
             self._out.clear()
             self._in.clear()
+            self._fetched()
             self._changed.notify_all()
         announce(self._root, "remove", self._properties())
         self._sysfs_link.unlink()
@@ -204,9 +221,11 @@ class UsbTestbed(UsbPipes):
 
     def _serve(self, connection: socket.socket, plugged: _Plugged) -> None:
         """Answer one open device file of the program, until it closes it."""
-        client = _Client(connection)
+        client = _Program(connection)
         try:
             for request, address in client.ioctls():
+                if client.owes is not None:
+                    self._take(client, plugged, client.owes)
                 self._answer(client, plugged, request, address)
         except (EOFError, OSError):
             pass
@@ -217,7 +236,7 @@ class UsbTestbed(UsbPipes):
                     plugged.pending.clear()
             connection.close()
 
-    def _answer(self, client: _Client, plugged: _Plugged, request: int, address: int) -> None:
+    def _answer(self, client: _Program, plugged: _Plugged, request: int, address: int) -> None:
         if request in _REAP:
             self._reap(client, plugged, address)
         elif plugged.is_gone:
@@ -240,7 +259,7 @@ class UsbTestbed(UsbPipes):
         else:
             client.fail(errno.ENOTTY)
 
-    def _accept_state(self, client: _Client, plugged: _Plugged, request: int) -> None:
+    def _accept_state(self, client: _Program, plugged: _Plugged, request: int) -> None:
         """What a request changes about the device."""
         if request == _CLAIM:
             plugged.claimed_by = client
@@ -251,50 +270,56 @@ class UsbTestbed(UsbPipes):
                 plugged.is_halted = False
                 self._fill()
 
-    def _reap(self, client: _Client, plugged: _Plugged, address: int) -> None:
+    def _reap(self, client: _Program, plugged: _Plugged, address: int) -> None:
         """Hand over a finished transfer, or say that there is none yet."""
         with self._changed:
             if not (plugged.done or plugged.is_gone or client.has_reaped):
                 self._changed.wait_for(lambda: plugged.done or plugged.is_gone, _HOLD_S)
             urb = plugged.done.popleft() if plugged.done else None
-            client.has_reaped = urb is not None  # libusb then asks for more before it does anything else
+            client.has_reaped = urb is not None
         if urb is None:
             client.fail(errno.ENODEV if plugged.is_gone else errno.EAGAIN)
             return
-        outcome: list[tuple[int, bytes | memoryview]] = [(urb.buffer, urb.data)] if len(urb.data) else []
-        outcome.append((urb.address + _STATUS_AT, struct.pack("<i", urb.status)))
-        outcome.append((urb.address + _ACTUAL_AT, struct.pack("<i", urb.actual)))
+        outcome: list[tuple[int, bytes | memoryview]] = [(urb.data_at, urb.data)] if len(urb.data) else []
+        outcome.append((urb.address + _OUTCOME_AT, urb.outcome()))
         client.done([*outcome, (address, struct.pack("<Q", urb.address))])
 
-    def _submit(self, client: _Client, plugged: _Plugged, address: int) -> None:
-        kind, endpoint, _, _, buffer, size, *_ = _URB.unpack(client.fetch(address, _URB.size))
-        urb = _Urb(address, buffer, size)
-        sent = client.fetch(buffer, size) if kind == _TYPE_CONTROL or endpoint == BULK_OUT else b""
-        with self._changed:
-            if kind == _TYPE_CONTROL:
-                self._control(urb, sent)
-                plugged.done.append(urb)
-            elif endpoint == BULK_OUT:
-                if self._refuses(plugged):
-                    urb.status = -errno.EPIPE
-                else:
-                    self._in.append(sent)
-                    urb.actual = size
-                plugged.done.append(urb)
-            elif endpoint == BULK_IN:
+    def _submit(self, client: _Program, plugged: _Plugged, address: int) -> None:
+        """Take a transfer over. What one outward carries is fetched when the program comes to ask what became of it:
+        a read then takes one round, not two, and there are thousands a second."""
+        kind, endpoint, _, flags, buffer, size, *_ = _URB.unpack(client.fetch_last(address, _URB.size))
+        urb = _Urb(address, kind, flags, buffer, size)
+        if kind == _TYPE_CONTROL or endpoint == BULK_OUT:
+            client.owes = urb
+        elif endpoint == BULK_IN:
+            with self._changed:
                 plugged.pending.append(urb)
                 self._fill()
+                if plugged.is_gone:
+                    plugged.fail_pending()
+
+    def _take(self, client: _Program, plugged: _Plugged, urb: _Urb) -> None:
+        """What goes outward."""
+        sent, client.owes = client.fetch(urb.buffer, urb.size), None
+        with self._changed:
             if plugged.is_gone:
-                plugged.fail_pending()
+                urb.status = -errno.ESHUTDOWN
+            elif urb.kind == _TYPE_CONTROL:
+                self._control(urb, sent)
+            elif self._refuses(plugged):
+                urb.status = -errno.EPIPE
+            else:
+                self._in.append(sent)
+                urb.actual = urb.size
+            plugged.done.append(urb)
             self._changed.notify_all()
-        client.done()
 
     def _control(self, urb: _Urb, sent: bytes) -> None:
         """Strings are told, everything outward is taken, everything else stalls."""
         kind, request, value, _, size = _SETUP.unpack_from(sent)
         text = self.identity.string_descriptor(value & 0xFF) if (kind, request, value >> 8) == (0x80, 6, 3) else None
         if text is not None:
-            urb.data, urb.actual, urb.buffer = text[:size], min(len(text), size), urb.buffer + _SETUP.size
+            urb.data, urb.actual, urb.data_at = text[:size], min(len(text), size), urb.buffer + _SETUP.size
         elif kind & 0x80:
             urb.status = -errno.EPIPE
         else:
@@ -322,12 +347,14 @@ class UsbTestbed(UsbPipes):
             plugged.done.append(urb)
         while plugged.pending and self._out and not plugged.is_halted:
             urb, data = plugged.pending.popleft(), self._out.popleft()
-            urb.data = data[: urb.size]
+            urb.data, urb.data_at = data[: urb.size], urb.buffer
             urb.actual = len(urb.data)
             if len(data) > urb.size:
                 self._out.appendleft(data[urb.size :])
             plugged.done.append(urb)
-        self._changed.notify_all()
+        self._fetched()
+        if plugged.done:
+            self._changed.notify_all()
 
     def _discard(self, plugged: _Plugged, address: int) -> bool:
         """The program gives a transfer up."""
@@ -340,56 +367,3 @@ class UsbTestbed(UsbPipes):
                     self._changed.notify_all()
                     return True
         return False
-
-
-class _Client:
-    """The preload library at the other end of a socket: its ioctls come, its memory is read and written."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self._connection = connection
-        self.has_reaped = False
-
-    def ioctls(self) -> Iterator[tuple[int, int]]:
-        """(request, address of the argument) of each ioctl, which wants `done` or `fail`; EOFError at the end."""
-        while True:
-            kind, request, address = _MESSAGE.unpack(self._receive(_MESSAGE.size))
-            if kind == _IOCTL:
-                yield request & 0xFFFFFFFF, address
-            else:
-                self._connection.sendall(_MESSAGE.pack(_DONE, _NOT_MINE, 0))
-
-    def fetch(self, address: int, size: int) -> bytes:
-        """Bytes of the program's memory."""
-        self._connection.sendall(_MESSAGE.pack(_READ, address, size))
-        return self._receive(size)
-
-    def done(self, writes: list[tuple[int, bytes | memoryview]] | None = None, result: int = 0) -> None:
-        """The ioctl succeeded, after these bytes are written to these addresses."""
-        parts: list[bytes | memoryview] = []
-        for address, data in writes or []:
-            parts += (_MESSAGE.pack(_WRITE, address, len(data)), data)
-        parts.append(_MESSAGE.pack(_DONE, result, 0))
-        sent = self._connection.sendmsg(parts)  # at once: between two calls our thread would wait for the table's
-        if sent < sum(map(len, parts)):  # interrupted
-            self._connection.sendall(b"".join(parts)[sent:])
-
-    def fail(self, number: int) -> None:
-        """The ioctl failed."""
-        self._connection.sendall(_MESSAGE.pack(_DONE, _MINUS_1, number))
-
-    def _receive(self, size: int) -> bytes:
-        data = self._connection.recv(size, socket.MSG_WAITALL)
-        if len(data) < size:
-            raise EOFError
-        return data
-
-
-def is_available() -> bool:
-    """Whether this machine has the preload library."""
-    folders = (Path(folder) for folder in ("/lib", "/usr/lib", "/usr/local/lib", "/usr/lib64"))
-    return any(any(folder.glob(f"**/{PRELOAD}")) for folder in folders if folder.is_dir())
-
-
-def is_under_preload() -> bool:
-    """Whether this very process sees a testbed instead of real USB."""
-    return "UMOCKDEV_DIR" in os.environ and PRELOAD in os.environ.get("LD_PRELOAD", "")

@@ -65,7 +65,7 @@ class Line:
 
 def run(repeats: int) -> dict[str, Any]:
     """Everything, each a third as often as `repeats` says. Raises ConfigError where USB cannot be emulated."""
-    from simulators.usb_testbed import PRELOAD, is_available
+    from simulators.usb_preload import PRELOAD, is_available
 
     if not is_available():
         raise ConfigError(f"bench: no {PRELOAD} here: apt-get install umockdev libusb-1.0-0")

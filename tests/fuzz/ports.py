@@ -29,7 +29,8 @@ from protocol import pairing
 from protocol.errors import FoveascanError
 from protocol.framing import SERIAL_PAYLOAD_MAX, USB_PAYLOAD_MAX
 from simulators.carriers import PtyPort
-from simulators.usb_testbed import PRELOAD, UsbTestbed, is_available
+from simulators.usb_preload import PRELOAD, is_available
+from simulators.usb_testbed import UsbTestbed
 from tests.exchange.grids import vase
 from tests.fuzz.lying_scanner import HonestScanner, LyingScanner
 from tests.fuzz.network import ask_everything, attack_http, attack_stream

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from foveascan import PROGRAM
-from simulators.usb_testbed import PRELOAD, is_available
+from simulators.usb_preload import PRELOAD, is_available
 from tests.fuzz.campaign import GROWN_MB_MAX
 from tests.fuzz.parsers import targets
 from tests.fuzz.ports import PORTS, attack

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -168,9 +169,18 @@ def test_a_faulty_buffered_scanner_still_serves_the_truth(tmp_path: Path) -> Non
         assert sweep(link) == clean
 
 
-def test_a_usb_scanner_tells_the_environment_the_node_needs(tmp_path: Path) -> None:
-    with simulated(tmp_path / "usb", "--link", "usb", "--specimen", "sphere") as (_, ready):
-        assert ready["path"] == "usb:1209:5ca1" and ready["environment"]["UMOCKDEV_DIR"] == str(tmp_path / "usb")
+def test_a_usb_scanner_tells_the_environment_the_node_needs() -> None:
+    with (
+        tempfile.TemporaryDirectory(prefix="fs-") as folder,
+        simulated(Path(folder, "usb"), "--link", "usb", "--specimen", "sphere") as (_, ready),
+    ):
+        assert ready["path"] == "usb:1209:5ca1" and ready["environment"]["UMOCKDEV_DIR"] == f"{folder}/usb"
+
+
+def test_a_usb_scanner_at_a_path_too_long_for_sockets_says_so(tmp_path: Path) -> None:
+    args = parse("--path", str(tmp_path / ("long" * 25)), "--link", "usb", "--specimen", "cylinder")
+    with pytest.raises(OSError, match="choose a shorter one"):
+        args.run(args)
 
 
 @pytest.mark.parametrize("link", ["gadget", "acm"])

@@ -24,7 +24,7 @@ from drivers.tcp_port import TcpPort
 from drivers.usb_port import UsbAddress, UsbPort
 from node.assemble import Assembler, Assembly
 from node.journal import Interrupted, Journal, Journals
-from node.resume import add_column, encoder_of
+from node.resume import add_column, assembler_of
 from node.turns import TurnEvents, TurnStarted, gone_on, swept
 from protocol.errors import DriverError, PortLost
 from protocol.framing import USB_PAYLOAD_MAX
@@ -268,7 +268,7 @@ class Capturing:
                     self._ending.turns.append(turn.channels)
                 case SweepStarted(header) if self._journal is None:
                     self._journal = self._journals.begin(info, header, time.time())
-                    self._assembler = Assembler(header.spec, encoder_of(header))
+                    self._assembler = assembler_of(header)
                     self._cut, self._ending.kind = (info, header), "interrupted"
                 case RangeColumn() | TextureColumn():
                     assert self._journal is not None and self._assembler is not None

@@ -15,7 +15,7 @@ from node.scan_quality import ScanQuality
 from protocol.errors import PortLost
 from protocol.scanner_messages import Channel, Order, SweepRequest
 from simulators.scanner import APART, TOGETHER
-from simulators.usb_testbed import is_available
+from simulators.usb_preload import is_available
 from tests.system.fault_rig import (
     REQUEST,
     SPEC,

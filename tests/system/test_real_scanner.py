@@ -16,7 +16,7 @@ from drivers.conformance import examine_link
 from drivers.discover import config_for, open_port
 from drivers.scanner import Scanner, SweepFinished, SweepInterrupted, SweepStarted
 from node.assemble import Assembler
-from node.resume import add_column, encoder_of
+from node.resume import add_column, assembler_of
 from protocol.grid import Grid
 from protocol.scanner_messages import RangeColumn, SweepHeader, SweepRequest, TextureColumn
 from tests.system.fault_rig import Bench, pty
@@ -47,7 +47,7 @@ def swept(scanner: Scanner, request: SweepRequest) -> tuple[SweepHeader, Grid]:
     assembler: Assembler | None = None
     for event in scanner.sweep(request):
         if isinstance(event, SweepStarted):
-            header, assembler = event.header, Assembler(event.header.spec, encoder_of(event.header))
+            header, assembler = event.header, assembler_of(event.header)
         elif isinstance(event, RangeColumn | TextureColumn):
             assert assembler is not None
             add_column(assembler, event)

@@ -18,7 +18,7 @@ from client.transfer import fetch_scan
 from exchange.native import read_native
 from foveascan import PROGRAM, started
 from protocol.grid import Grid
-from simulators.usb_testbed import PRELOAD, is_available
+from simulators.usb_preload import PRELOAD, is_available
 from tests.system.line import RunningNode, run_line
 from tests.system.usb_bed import CONTROLLERS
 

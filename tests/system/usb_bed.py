@@ -16,7 +16,8 @@ from typing import TypeVar
 from simulators.tty_gadget import TtyGadget
 from simulators.usb_descriptors import CDC_IDENTITY, UsbIdentity
 from simulators.usb_gadget import UsbGadget
-from simulators.usb_testbed import UsbTestbed, is_under_preload
+from simulators.usb_preload import is_under_preload
+from simulators.usb_testbed import UsbTestbed
 
 CONTROLLERS = os.environ.get("FOVEASCAN_UDC", "").split()
 HAS_USB = is_under_preload() or bool(CONTROLLERS)

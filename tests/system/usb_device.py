@@ -108,7 +108,8 @@ def test_many_small_transfers_are_taken_at_once(bed: Bed, port: UsbPort) -> None
     got, reads = b"", 0
     while len(got) < 100 * PENDING:
         got, reads = got + port.read(1 << 20, 5), reads + 1
-    assert got == b"".join(words) and reads < PENDING
+    assert got == b"".join(words)
+    assert reads < PENDING or isinstance(bed, UsbGadget)  # whose controller sends when it comes round
 
 
 def test_what_nobody_reads_has_to_wait_and_is_not_lost(bed: Bed, port: UsbPort) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from simulators.usb_testbed import PRELOAD, is_available
+from simulators.usb_preload import PRELOAD, is_available
 from tests.node.sealed_places import require_mounts
 from tests.systemd.booted import ROOT, Machine, booted, why_not
 
