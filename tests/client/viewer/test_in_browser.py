@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -165,6 +167,18 @@ def test_detail_follows_the_pointer(browser: Browser, node: RunningNode) -> None
         page.mouse.move(box["x"] + 0.48 * box["width"], box["y"] + 0.5 * box["height"])
         page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
         page.wait_for_selector('html[data-updates][data-looking="no"]', state="attached")  # of one look or of both
+
+
+def test_what_is_long_in_coming_is_shown_where_it_will_be(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        os.kill(node.process.pid, signal.SIGSTOP)
+        try:
+            click(page, 0.5, 0.5)
+            page.wait_for_selector(".busy:not([hidden])", state="attached")
+        finally:
+            os.kill(node.process.pid, signal.SIGCONT)
+        wait_updates(page, 1)
+        assert page.locator(".busy").get_attribute("hidden") is not None
 
 
 def test_what_is_coming_can_be_stopped(browser: Browser, node: RunningNode) -> None:
