@@ -12,7 +12,8 @@ export async function decodeMask(payload: Uint8Array, height: number, width: num
   if (data.length === 0) throw new RemoteWireError('mask is empty');
   if (data[0] !== 0) return fillBetweenEdges(mask, parseVarints(data, 3), height, width);
   if (data.length !== 1 + bits) throw new RemoteWireError('mask has fewer bits than samples');
-  return mask.map((_, index) => (data[1 + (index >> 3)]! >> (7 - (index & 7))) & 1);
+  for (let index = 0; index < mask.length; index++) mask[index] = (data[1 + (index >> 3)]! >> (7 - (index & 7))) & 1;
+  return mask;
 }
 
 function fillBetweenEdges(mask: Uint8Array, numbers: number[], height: number, width: number): Uint8Array {

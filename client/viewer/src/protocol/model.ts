@@ -208,7 +208,5 @@ async function texturePatches({ payload, mask, codec, quality }: Refinement, str
 async function applyMask(steps: Uint16Array, mask: Uint8Array, codecs: Codecs, height: number, width: number): Promise<void> {
   if (mask.length === 0) return;
   const voids = await codecs.mask(mask, height, width);
-  voids.forEach((isVoid, index) => {
-    if (isVoid) steps[index] = 0;
-  });
+  for (let index = 0; index < voids.length; index++) if (voids[index]) steps[index] = 0;
 }
