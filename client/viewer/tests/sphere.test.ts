@@ -12,6 +12,7 @@ import { Model } from '../src/protocol/model.ts';
 import { COARSE, FOVEA, parseRefinement } from '../src/protocol/refinement.ts';
 import type { Refinement } from '../src/protocol/refinement.ts';
 import { ringStrides } from '../src/protocol/rings.ts';
+import type { ScanInfo } from '../src/protocol/messages.ts';
 import { buildStrips, samplesOf, selectStrips, splitParts } from '../src/protocol/strips.ts';
 import { bytes, fromHex, json, words, worst } from './golden.ts';
 
@@ -25,9 +26,9 @@ const INFO = {
 const SHAPE: ChannelShape = { channel: RANGE, width: 64, height: 136, coarseWidth: 8, coarseHeight: 17, sphere: true };
 
 /** A model with a first view that is 1 everywhere, whose JPEGs decode to what `texels` says. */
-async function opened(texels: (count: number) => Uint8Array): Promise<{ model: Model; codecs: Codecs }> {
+async function opened(texels: (count: number) => Uint8Array, info: ScanInfo = INFO): Promise<{ model: Model; codecs: Codecs }> {
   const codecs = new Codecs(() => Promise.reject(new Error('no HTJ2K here')), (_, width, height) => Promise.resolve(texels(width * height)));
-  const model = new Model(INFO, 1);
+  const model = new Model(info, 1);
   const size = INFO.coarseWidth * INFO.coarseHeight;
   const ones = littleEndian(new Uint16Array(size).fill(1));
   await model.apply(refinement({ generator: COARSE, channel: RANGE, payload: ones, samples: size }), codecs);
@@ -91,6 +92,37 @@ test('texture of a sphere agrees within the tolerance', async () => {
     const payload = strips.length > 1 ? fromHex('02000000ffd9'.repeat(strips.length)) : SCANLESS;
     await model.apply(refinement({ channel: TEXTURE, codec: JPEG, quality: QUALITY, samples: samplesOf(strips), parameters, payload }), codecs);
     assert.ok(worst(new Uint8Array(model.texels.buffer), bytes(`sphere/${want.dense}`)) <= want.tolerance, want.dense);
+  }
+});
+
+test('what has changed is told as it is held, adopted whole or in part', async () => {
+  const colours = (count: number) => Uint8Array.from({ length: 4 * count }, (_, k) => mix32(k) % 256);
+  for (const geometry of ['cylinder', 'sphere'] as const) {
+    const { model, codecs } = await opened(colours, { ...INFO, geometry });
+    for (const channel of [RANGE, TEXTURE] as const) {
+      const whole: boolean[] = [];
+      for (const further of [0, 1]) {
+        const parameters = { halfSpacing: 2, blockX: 1 + further, blockY: (channel === RANGE ? 7 : 3) + further, blocksWide: 2, blocksHigh: 2, rhoX: 0, rhoY: 0, listed: null };
+        const strips = selectStrips(buildStrips(model.shapes[channel], parameters), model.holdings.channels[channel], rankOf(channel, QUALITY));
+        whole.push(strips.every(({ selection }) => !selection.adopted.includes(0)));
+        const samples = samplesOf(strips);
+        const values = littleEndian(Uint16Array.from({ length: samples }, (_, k) => 1 + (mix32(k) % 900)));
+        const changed = await model.apply(
+          refinement(channel === RANGE ? { channel, quality: QUALITY, samples, parameters, payload: values } : { channel, codec: JPEG, quality: QUALITY, samples, parameters, payload: SCANLESS }),
+          codecs,
+        );
+        const held = channel === RANGE ? model.steps : model.texels;
+        assert.ok(changed.length);
+        for (const { x, y, width, height, cells } of changed) {
+          const told = channel === RANGE ? cells : new Uint32Array(cells.slice().buffer);
+          for (let row = 0; row < height; row++) {
+            const from = (y + row) * INFO.width + x;
+            assert.deepEqual([...told.subarray(row * width, (row + 1) * width)], [...held.subarray(from, from + width)], `${geometry} ${channel}`);
+          }
+        }
+      }
+      if (geometry === 'cylinder' && channel === TEXTURE) assert.deepEqual(whole, [true, false]);
+    }
   }
 });
 

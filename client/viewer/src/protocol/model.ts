@@ -156,20 +156,26 @@ export class Model {
       const rectangle = denseOf(patches[index]!, selection, 1);
       paste(this.steps, rectangle, selection);
       for (const [block, hash] of contentHashes(rectangle, selection)) this.holdings.addContent(block, hash);
-      return this.cut(this.steps, selection);
+      return this.cut(this.steps, selection, rectangle);
     });
   }
 
   private pasteTexture(strips: Chosen[], patches: Uint8Array[]): Changed[] {
     return strips.flatMap(({ selection }, index) => {
       const rectangle = denseOf(patches[index]!, selection, 4);
-      paste(this.texels, new Uint32Array(rectangle.buffer), selection);
-      return this.cut(this.texels, selection);
+      paste(this.texels, new Uint32Array(rectangle.buffer, rectangle.byteOffset, rectangle.length / 4), selection);
+      return this.cut(this.texels, selection, rectangle);
     });
   }
 
-  private cut(dense: Uint16Array | Uint32Array, selection: Selection): Changed[] {
-    return spans(selection).map(({ x, y, width, height }) => {
+  /** What has changed; where all of a rectangle was adopted, that itself. */
+  private cut(dense: Uint16Array | Uint32Array, selection: Selection, rectangle: Changed['cells']): Changed[] {
+    const parts = spans(selection);
+    if (parts.length === 1 && !selection.adopted.includes(0)) {
+      const { x, y, width, height } = parts[0]!;
+      return [{ x, y, width, height, cells: rectangle }];
+    }
+    return parts.map(({ x, y, width, height }) => {
       const cells = dense instanceof Uint16Array ? new Uint16Array(width * height) : new Uint32Array(width * height);
       const side = selection.lattice.shape.width;
       for (let row = 0; row < height; row++) {

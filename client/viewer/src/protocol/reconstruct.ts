@@ -141,7 +141,7 @@ export function rangePatch({ y, x }: Selection, samples: Uint16Array): Uint16Arr
   return patch;
 }
 
-/** Dense texture of the windows' rectangle as RGBA, from RGBA samples. */
+/** Dense texture of the windows' rectangle as RGBA, from RGBA samples; these themselves where each is a cell's. */
 export function texturePatch({ y, x }: Selection, samples: Uint8Array): Uint8Array {
   const [rows, columns, wide] = [y.low.length, x.low.length, x.sample.length];
   if (isWhole(y) && isWhole(x)) return copyCells(samples, y, x);
@@ -195,6 +195,8 @@ function copyCells(samples: Uint8Array, y: Window, x: Window): Uint8Array {
   const nearest = (axis: Window, at: number) => (axis.part[at] === 0 ? axis.low[at]! : axis.high[at]!);
   const from = Int32Array.from({ length: columns }, (_, c) => nearest(x, c));
   const isRun = from.every((sample, c) => sample === from[0]! + c);
+  const isAll = isRun && columns === x.sample.length && rows === y.sample.length && y.low.every((_, r) => nearest(y, r) === r);
+  if (isAll) return samples;
   for (let r = 0; r < rows; r++) {
     const row = nearest(y, r) * x.sample.length;
     if (isRun) patch.set(source.subarray(row + from[0]!, row + from[0]! + columns), r * columns);
