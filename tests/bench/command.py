@@ -116,7 +116,7 @@ def _page(args: argparse.Namespace, scans: list[BenchScan]) -> Told:
 
     from tests.bench import page
 
-    record = asyncio.run(page.run(scans[0], args.clicks, args.repeats, args.seconds))
+    record = asyncio.run(page.run(scans[0], args.clicks, args.repeats, args.seconds, args.graphics))
     return record, page.told(record)
 
 
@@ -176,6 +176,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rival", action="append", metavar="NAME", help="roi: only these rivals")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="roi: write PNGs of bytes against quality")
     parser.add_argument("--seconds", type=float, default=60, metavar="S", help="page, load: of random clicks (60)")
+    parser.add_argument(
+        "--graphics", choices=("software", "card"), default="software", help="page: what draws it (software)"
+    )
     parser.add_argument("--target", action="append", metavar="NAME", help="fuzz: only these parsers or ports")
     parser.add_argument("--count", type=_some, default=100_000, metavar="N", help="fuzz: messages for each (100000)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="fuzz: other messages (0)")

@@ -11,20 +11,21 @@ from __future__ import annotations
 
 import random
 from collections.abc import AsyncIterator, Iterable
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 from aiohttp import web
-from playwright.async_api import Page, TimeoutError, async_playwright
+from playwright.async_api import Browser, Page, TimeoutError, async_playwright
 
+from protocol.errors import ConfigError
 from tests.bench.ours import node_at
 from tests.bench.page_memory import memory
 from tests.bench.page_processes import Processes, Spent
 from tests.bench.scans import SEED, BenchScan
-from tests.client.viewer.browser import ARGUMENTS, CHROMIUM
+from tests.client.viewer.browser import CALLS_NOBODY, CHROMIUM, GRAPHICS
 
 HERE = Path(__file__).parent
 HOOK = HERE / "page_hook.js"
@@ -33,6 +34,11 @@ VIEWPORT = {"width": 1000, "height": 700}
 SPOT = 0.24  # clicks fall so far from the middle, at most: onto the object
 CLICK_TRIES = 3  # on a machine so busy that a click takes half a second, it is none
 ASKED = {"first_ms": 150, "click_ms": 50, "update_ms": 8}
+PROCESSORS = ("SwiftShader", "llvmpipe")  # names of renderers without a card
+RENDERER = """() => {
+  const gl = document.createElement('canvas').getContext('webgl2');
+  return gl?.getParameter(gl.getExtension('WEBGL_debug_renderer_info').UNMASKED_RENDERER_WEBGL) ?? '';
+}"""
 FORGET = "() => ['frames', 'messages', 'painting', 'tasks'].forEach((list) => (bench[list].length = 0))"
 DRAWN = "() => bench.frames.some((frame) => frame.end !== null)"
 ANY, OF_A_SCAN = "frame", "frame of a scan"  # what the hook says when one is drawn
@@ -55,17 +61,23 @@ STEPS = """() => {
 }"""
 
 
-async def run(scan: BenchScan, clicks: int, repeats: int, seconds: float) -> dict[str, Any]:
-    """Measure on one scan. seconds : of random clicks, to see whether memory grows."""
-    async with node_at([scan]) as (ours, pid, _, _), _empty_page() as empty, async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+async def run(scan: BenchScan, clicks: int, repeats: int, seconds: float, graphics: str) -> dict[str, Any]:
+    """Measure on one scan. Raises ConfigError where there is no such graphics.
+
+    seconds : of random clicks, to see whether memory grows.  graphics : one of `GRAPHICS`.
+    """
+    async with async_playwright() as playwright, AsyncExitStack() as stack:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=[*GRAPHICS[graphics], *CALLS_NOBODY])
+        renderer = await _renderer(browser, graphics)
+        ours, pid, _, _ = await stack.enter_async_context(node_at([scan]))
+        empty = await stack.enter_async_context(_empty_page())
         context = await browser.new_context(viewport=VIEWPORT, reduced_motion="reduce")  # type: ignore[arg-type]
         await context.add_init_script(path=HOOK)
         processes = Processes(await browser.new_browser_cdp_session(), pid)
         page = await context.new_page()
         empty += "#" + ",".join(map(str, await _picture_size(page, ours)))
         record = {
-            "scan": scan.name, "size": scan.size, "repeats": repeats, "clicks": clicks,
+            "scan": scan.name, "size": scan.size, "repeats": repeats, "clicks": clicks, "renderer": renderer,
             "first": await _first_views(page, processes, ours, empty, repeats),
             **await _clicks(page, await context.new_page(), processes, ours, empty, clicks),
             "memory": None,
@@ -82,6 +94,7 @@ def told(record: dict[str, Any]) -> str:
     first, click, update, redraw = (record[name] for name in ("first", "click", "update", "redraw"))
     lines = [
         f"{record['scan']} {record['size']}, medians; in brackets, of what an empty frame takes",
+        f"drawn by {record['renderer']}",
         f"address to a picture of the first view: {first['picture_ms']:.0f} ms, asked {ASKED['first_ms']} ms",
         f"address to the model of it drawn: {_beside(first)}",
         *_in_parts(first),
@@ -134,8 +147,21 @@ async def _empty_page() -> AsyncIterator[str]:
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)
     await site.start()
-    yield f"http://127.0.0.1:{runner.addresses[0][1]}/"
-    await runner.cleanup()
+    try:
+        yield f"http://127.0.0.1:{runner.addresses[0][1]}/"
+    finally:
+        await runner.cleanup()
+
+
+async def _renderer(browser: Browser, graphics: str) -> str:
+    """What draws, by its own name. Raises ConfigError where it is not what was asked for."""
+    page = await browser.new_page()
+    name: str = await page.evaluate(RENDERER)
+    await page.close()
+    if not name or (graphics == "card" and any(processor in name for processor in PROCESSORS)):
+        cure = "; a card needs its Vulkan driver installed" if graphics == "card" else ""
+        raise ConfigError(f"bench: --graphics {graphics}: chromium draws WebGL by {name or 'nothing'}{cure}")
+    return name
 
 
 async def _open(page: Page, address: str, shown: str) -> None:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 import foveascan
+from protocol.errors import ConfigError
 from tests.bench import alpha, codec, line, page, page_memory, plots, rate, roi, sphere
 from tests.bench.cache import Cache
 from tests.bench.rivals.offer import straight
 from tests.bench.scans import BenchScan, load
 from tests.bench.target import Target, Window
+from tests.client.viewer.browser import GRAPHICS
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +60,17 @@ def test_alpha_compares_profiles_at_equal_bytes(scan: BenchScan, monkeypatch: py
 
 
 def test_the_page_is_measured_beside_an_empty_one(scan: BenchScan) -> None:
-    record = asyncio.run(page.run(scan, 2, 1, 1.0))
+    record = asyncio.run(page.run(scan, 2, 1, 1.0, "software"))
     assert record["first"]["ms"] > 0 < record["first"]["empty_ms"]
     assert record["click"]["count"]
     assert len(record["memory"]["mb"]["page process"]) == page_memory.ROUNDS + 1
-    assert page.told(record)
+    assert record["renderer"] in page.told(record)
+
+
+def test_no_figures_of_a_processor_pass_for_a_card_s(scan: BenchScan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(GRAPHICS, "card", GRAPHICS["software"])  # what chromium makes of it without a card
+    with pytest.raises(ConfigError, match="draws WebGL by .*SwiftShader.*Vulkan driver"):
+        asyncio.run(page.run(scan, 1, 1, 0.0, "card"))
 
 
 def test_clicks_on_a_closed_object_reach_their_quality() -> None:

@@ -16,11 +16,16 @@ from playwright.sync_api import Browser, Page, Playwright
 import hatch_build
 
 CHROMIUM = "/usr/bin/chromium"
-# Software rendering, so that every machine draws alike; and no calls home.
-ARGUMENTS = (
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+# What draws: the processor, so that every machine draws alike; or this machine's graphics card, without a display.
+GRAPHICS = {
+    "software": ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    "card": ("--use-angle=vulkan", "--ignore-gpu-blocklist"),  # not --enable-features=Vulkan: it loses its contexts
+}
+CALLS_NOBODY = (
+    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
 )  # fmt: skip
+ARGUMENTS = (*GRAPHICS["software"], *CALLS_NOBODY)
 WAIT_MS = 60_000  # at most; a machine under load takes its time
 AXE = hatch_build.VIEWER / "node_modules" / "axe-core" / "axe.min.js"
 FAULTS = Path(__file__).with_name("layout_faults.js").read_text().split("\n", 2)[2]
