@@ -78,7 +78,10 @@ class ReadingAhead:
         self._libusb["interrupt_event_handler"](self._backend.ctx)
 
     def bulk_read(self, handle: Any, endpoint: int, interface: int, buffer: Any, timeout_ms: int) -> int:
-        """What has come, as much as there is room for; else what comes first. Raises USBTimeoutError, USBError."""
+        """What has come, as much as there is room for; else what comes first. Raises USBTimeoutError, USBError.
+
+        buffer : as large as it was at the first time, which is how much a read asks for.
+        """
         if endpoint not in self._queues:
             self._queues[endpoint] = _Queue(self._libusb, self._backend.ctx, handle.handle, endpoint, len(buffer))
         queue, until_s, view = self._queues[endpoint], time.monotonic() + timeout_ms / 1000, memoryview(buffer)
@@ -130,27 +133,27 @@ class _Queue:
         transfers = [libusb["alloc_transfer"](0) for _ in range(PENDING)]
         self._idle = [_Read(transfer, device, endpoint, size) for transfer in transfers]
         self._pending: deque[_Read] = deque()
-        self._taken = 0  # bytes of the first one
         self._left = b""  # of reads that were withdrawn
 
     def take(self, into: memoryview) -> int:
-        """Bytes that have come, put `into`; 0 when there are none. Raises USBError once all before it are taken."""
+        """What has come, put `into`, as many reads as fit whole: where a read ends, most often a frame does. 0 when
+        there is nothing. Raises USBError once all before it is taken."""
         size = min(len(self._left), len(into))
         into[:size], self._left = self._left[:size], self._left[size:]
         self._submit()
-        while size < len(into) and self._pending and self._pending[0].is_done:
+        while self._pending and self._pending[0].is_done:
             read = self._pending[0]
-            part = min(read.transfer.actual_length - self._taken, len(into) - size)
-            into[size : size + part] = read.view[self._taken : self._taken + part]
-            size, self._taken = size + part, self._taken + part
-            if self._taken < read.transfer.actual_length:
+            end = size + read.transfer.actual_length
+            if end > len(into):
                 break
+            into[size:end] = read.view[: end - size]
+            size = end
             if read.transfer.status != _COMPLETED:
+                read.transfer.actual_length = 0
                 if size:
                     break
                 raise self._error(_ERROR_OF.get(read.transfer.status, -1))
             self._idle.append(self._pending.popleft())
-            self._taken = 0
             self._submit()
         return size
 
@@ -173,11 +176,9 @@ class _Queue:
             self.wait(left_s)
         if self._is_running():
             raise self._error(-1)
-        came = b"".join(read.view[: read.transfer.actual_length] for read in self._pending)
-        self._left += came[self._taken :]
+        self._left += b"".join(read.view[: read.transfer.actual_length] for read in self._pending)
         self._idle += self._pending
         self._pending.clear()
-        self._taken = 0
 
     def close(self) -> None:
         """Withdraw and free all; what a kernel does not give up is left to it, since it may still write there."""

@@ -20,6 +20,7 @@ from simulators.flaws import FLAWLESS, Flaws
 
 _COUNTS_MIN = 65536  # a coarser encoder would make jitter a matter of one or two counts
 _COUNT_LIMIT = 2**31
+_CHANNELS = {int(channel): channel for channel in (Channel.RANGE, Channel.TEXTURE)}  # looked up, thousands a second
 _JITTER_REACH = 0.4  # of a column; so columns of one channel never change places
 
 
@@ -57,12 +58,10 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True)
 class _Schedule:
-    """Triggers of a sweep in the order of their counts: four arrays (n,)."""
+    """Triggers of a sweep. counts : (n,) ascending.  triggers : count, channel, pass, column of each."""
 
     counts: IntArray
-    channels: IntArray
-    passes: IntArray
-    columns: IntArray
+    triggers: list[tuple[int, int, int, int]]
 
 
 class Turntable:
@@ -159,13 +158,10 @@ class Turntable:
 
     def _expose(self, index: int, position: float, rate: float) -> Exposure:
         """Trigger number `index`, while the table moves on from `position`."""
-        schedule = self._schedule
-        count = int(schedule.counts[index])
+        count, channel, pass_index, column = self._schedule.triggers[index]
         time_s = self._time_s + max(0.0, (count - position) / rate)
-        channel = Channel(int(schedule.channels[index]))
-        place = int(schedule.passes[index]), int(schedule.columns[index])
         turned = self._sense * count
-        return Exposure(channel, *place, self._shown(turned), round(1e6 * time_s), turned)
+        return Exposure(_CHANNELS[channel], pass_index, column, self._shown(turned), round(1e6 * time_s), turned)
 
     def _shown(self, turned: int) -> int:
         """The encoder's count when the table has turned so far since the start."""
@@ -192,7 +188,7 @@ class Turntable:
         ]
         table = np.concatenate([*parts, np.empty((0, 4), np.int64)])
         table = table[np.argsort(table[:, 0], kind="stable")]
-        return _Schedule(*(np.ascontiguousarray(part) for part in table.T))
+        return _Schedule(np.ascontiguousarray(table[:, 0]), [tuple(trigger) for trigger in table.tolist()])
 
     def _plan_channel(
         self, channel: Channel, width: int, passes_named: int, places: tuple[IntArray, IntArray]
