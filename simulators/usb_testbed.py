@@ -26,7 +26,7 @@ from simulators.usb_preload import PRELOAD, PreloadClient
 from simulators.usb_uevent import announce
 
 BUS_SWITCH_S = 0.00005  # for sys.setswitchinterval: the bus waits for the table's arithmetic no longer
-_HOLD_S = 0.002  # how long a reap waits for news: longer holds up writes, shorter spins
+_HOLD_S = 0.01  # how long a reap waits for news: longer holds up writes, shorter spins
 _URB = struct.Struct("<BBxxiIxxxxQiiiiIIQ")
 _OUTCOME_AT, _OUTCOME = 4, struct.Struct("<iIxxxxQii")  # from its status to its actual length
 _TYPE_CONTROL = 2
