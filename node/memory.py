@@ -1,9 +1,10 @@
 """Memory of a process that runs for months: what is let go of goes back soon, and what stays is looked at once.
 
 Python frees cycles (of a stream that ended in an error, say) when as much as a quarter of what stays has gathered. What
-a node imports and makes at its start stays for good and is large, so `settle` takes it out of that account. And glibc
+a node imports and makes at its start stays for good and is large, so `settle` takes it out of that account, and
+`keep_trimmed` does not wait for so many: with what stays set aside, a collection takes milliseconds. And glibc
 keeps what is freed for each arena apart, of which it makes up to eight a core: `bound_arenas`. Of that arena it gives
-back only the end: `keep_trimmed` gives back the rest. With TLS that matters most, since uvloop takes 256 KiB for a
+back only the end: `keep_trimmed` gives back the rest, too. With TLS that matters most, since uvloop takes 256 KiB for a
 connection and again for each read of one, and what is small and stays comes to lie between (MagicStack/uvloop#726).
 To have large blocks mapped one by one instead (M_MMAP_THRESHOLD) would make planning take twice the time.
 """
@@ -34,9 +35,11 @@ def settle() -> None:
 
 
 async def keep_trimmed(every_s: float = TRIM_S) -> None:
-    """Until cancelled, give freed memory back to the system now and then. Returns at once where the C library is not
-    glibc, which alone needs it."""
+    """Until cancelled, collect now and then what ended connections left, and give freed memory back to the system,
+    which glibc alone has to be told to do."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    while trim is not None:
+    while True:
         await asyncio.sleep(every_s)
-        await asyncio.to_thread(trim, 0)
+        gc.collect()
+        if trim is not None:
+            await asyncio.to_thread(trim, 0)

@@ -20,6 +20,7 @@ from tests.fuzz.ports import PORTS, attack
 from tests.fuzz.target import Found, Target, fuzz
 
 INPUTS, MESSAGES = 60, 600
+PARTS = 8  # all parsers in one test take longer than one may where much else runs
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +28,10 @@ def parsers(tmp_path_factory: pytest.TempPathFactory) -> list[Target]:
     return list(targets(tmp_path_factory.mktemp("fuzz")))
 
 
+@pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.filterwarnings("ignore")  # of readers about bytes that are none of theirs
-def test_parsers_raise_nothing_but_our_errors(parsers: list[Target]) -> None:
-    for target in parsers:
+def test_parsers_raise_nothing_but_our_errors(parsers: list[Target], part: int) -> None:
+    for target in parsers[part::PARTS]:
         fuzz(target, INPUTS)
 
 

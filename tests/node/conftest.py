@@ -1,4 +1,5 @@
-"""What tests of many files share: a scan to plan on; a capture thread and the plug of its scanner."""
+"""What tests of many files share: a scan to plan on; a capture thread and the plug of its scanner; whether
+anything can be mounted."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ import pytest
 from node.library import Scan
 from tests.node.capturing import Node, Plug
 from tests.node.scans import keep, make_grid
+from tests.node.sealed_places import require_mounts
 
 
 @pytest.fixture(scope="session")
@@ -31,3 +33,9 @@ def node(tmp_path: Path, plug: Plug) -> Iterator[Node]:
     node.capture.start()
     yield node
     node.capture.stop()
+
+
+@pytest.fixture
+def mounts() -> None:
+    """Skips where nothing can be mounted."""
+    require_mounts()

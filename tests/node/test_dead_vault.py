@@ -11,8 +11,10 @@ from node.library import About, Library
 from node.sealed import HAS_DIED
 from node.sealing import seal
 from tests.node.scans import make_grid
-from tests.node.sealed_places import KEY, open_at, require_mounts
+from tests.node.sealed_places import KEY, open_at
 from tests.node.served import served
+
+pytestmark = pytest.mark.usefixtures("mounts")
 
 SCAN_REQUESTS = [
     ("GET", ".glb"),
@@ -25,11 +27,6 @@ SCAN_REQUESTS = [
     ("POST", "/derive"),
     ("DELETE", ""),
 ]
-
-
-@pytest.fixture(autouse=True)
-def mounts() -> None:
-    require_mounts()
 
 
 async def test_every_request_for_a_scan_says_that_the_vault_has_died(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import gc
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +27,26 @@ def test_what_was_there_at_the_start_is_looked_at_no_more() -> None:
         assert not any(one is there for one in gc.get_objects())
     finally:
         gc.unfreeze()
+
+
+class Left:
+    """What holds itself, as what a stream leaves that ended in an error."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+async def test_what_ended_streams_left_is_collected_without_waiting_for_more() -> None:
+    gc.disable()  # so that only who is asked collects
+    try:
+        left = weakref.ref(Left())
+        trimming = asyncio.create_task(keep_trimmed(0.01))
+        async with asyncio.timeout(60):
+            while left() is not None:
+                await asyncio.sleep(0.01)
+        trimming.cancel()
+    finally:
+        gc.enable()
 
 
 @pytest.fixture

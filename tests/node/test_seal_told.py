@@ -16,8 +16,10 @@ from node.sealed import beside, is_sealed, sealed_folder, standing
 from node.sealing import rekey, seal, unseal
 from protocol.errors import LibraryError
 from tests.node.scans import make_grid
-from tests.node.sealed_places import KEY, require_mounts
+from tests.node.sealed_places import KEY
 from tests.permissions import bound_by_permissions
+
+pytestmark = pytest.mark.usefixtures("mounts")
 
 ROOT = Path(__file__).parents[2]
 STOPS = """
@@ -32,11 +34,6 @@ def interrupted(*arguments):
 sealing.{step} = interrupted
 sys.exit(foveascan.main(["library", sys.argv[1], "--library", sys.argv[2], "--key", sys.argv[3]]))
 """
-
-
-@pytest.fixture(autouse=True)
-def mounts() -> None:
-    require_mounts()
 
 
 @pytest.fixture

@@ -29,17 +29,14 @@ from protocol.errors import ConfigError, LibraryError
 from protocol.grid import GridSpec
 from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepHeader
 from tests.node.scans import make_grid
-from tests.node.sealed_places import KEY, open_at, require_mounts
+from tests.node.sealed_places import KEY, open_at
+
+pytestmark = pytest.mark.usefixtures("mounts")
 
 OTHER = KEY[::-1]
 SPEC = GridSpec(width=96, height=200, texture_width=32, texture_height=12, step_mm=0.05, pitch_mm=1.0)
 HEADER = SweepHeader(7, SPEC, 3200, range_rows=200, texture_rows=12, calibration=99)
 SAID = "mole beside the left ear"
-
-
-@pytest.fixture(autouse=True)
-def mounts() -> None:
-    require_mounts()
 
 
 @pytest.fixture
