@@ -29,8 +29,9 @@ SWEPT = "nutcracker"  # another object than the one looked at, so another scan
 SWEEP_SHARE = 0.6  # of the time, at the scanner's pace: what comes after it is to be seen, too
 PLACES = 400
 WARM_CLICKS, IDLE_CLICKS = 8, 40
-STALL_CLICKERS, STALL_S, STALL_ROUNDS = 4, 6.0, 3
+STALL_CLICKERS, STALL_S, STALL_TURNS = 4, 2.0, 7
 SAMPLE_S = 0.5
+CALM_S = 20.0  # in which a node gives freed memory back once
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 SETTINGS = """
 [capture]
@@ -80,6 +81,8 @@ def _measure(
         sweeping.start()
         busy = view(Orders(url, viewers, clickers, seconds, places))
         sweeping.join()
+    memory = {"before": then.own[0], "then": then.own[-1], "most_resident": max(then.resident)}
+    memory |= _calm(node, Orders(url, viewers, clickers, CALM_S, places))
     idle_s, busy_s = statistics.median(idle.latencies_s), sorted(busy.latencies_s)
     p99_s = _percentile(busy_s, 99)
     return {
@@ -93,12 +96,23 @@ def _measure(
             "node_cores": then.cpu_s / then.seconds, "viewers_cores": busy.cpu_s / seconds,
             "viewers_late_p99_s": _percentile(sorted(busy.late_s), 99),
         },
-        "memory_mb": then.memory_mb(), "sweep": swept, "stalled_reader": stalled,
+        "memory_mb": memory, "sweep": swept, "stalled_reader": stalled,
     }  # fmt: skip
 
 
 def _percentile(ascending: list[float], percent: int) -> float:
     return ascending[percent * (len(ascending) - 1) // 100]
+
+
+def _calm(node: Watched, orders: Orders) -> dict[str, float]:
+    """The node's memory in two turns of the same clicks when all else is done: as much in both, if it is flat. [MB]"""
+    asyncio.run(_surveyed(orders.url))
+    medians = {}
+    for turn in ("calm", "calm_again"):
+        with node.watching() as watching:
+            view(orders)
+        medians[turn] = statistics.median(watching.own)
+    return medians
 
 
 async def _surveyed(url: str) -> None:
@@ -109,14 +123,19 @@ async def _surveyed(url: str) -> None:
 
 
 def _stalled(url: str, places: list[tuple[float, float]]) -> dict[str, float]:
-    """What one reader that stalls costs the others: medians without and with it, in turns."""
-    medians: dict[int, list[float]] = {0: [], 1: []}
-    for turn in range(STALL_ROUNDS):
-        for stalled in medians:
-            orders = Orders(url, STALL_CLICKERS, STALL_CLICKERS, STALL_S, places, stalled=stalled, seed=turn)
-            medians[stalled].append(statistics.median(view(orders).latencies_s))
-    without_s, with_s = (statistics.median(medians[stalled]) for stalled in (0, 1))
-    return {"median_without_s": without_s, "median_with_s": with_s, "cost": with_s / without_s - 1}
+    """What one reader that stalls costs the others: it is there every other moment, and moments beside each other are
+    compared, so that what else the machine does counts for both."""
+    seconds = 2 * STALL_TURNS * STALL_S
+    report = view(Orders(url, STALL_CLICKERS, STALL_CLICKERS, seconds, places, stall_s=STALL_S))
+    moments: list[list[float]] = [[] for _ in range(2 * STALL_TURNS)]
+    for clicked_s, latency_s in zip(report.clicked_s, report.latencies_s, strict=True):
+        moments[min(int(clicked_s / STALL_S), len(moments) - 1)].append(latency_s)
+    medians = [statistics.median(moment) for moment in moments]
+    without_s, with_s = medians[::2], medians[1::2]
+    return {
+        "median_without_s": statistics.median(without_s), "median_with_s": statistics.median(with_s),
+        "cost": statistics.median(b / a for a, b in zip(without_s, with_s, strict=True)) - 1,
+    }  # fmt: skip
 
 
 async def _sweep(url: str) -> dict[str, Any]:
@@ -153,11 +172,6 @@ class Watching:
     cpu_s: float = 0.0
     resident: list[float] = field(default_factory=list)
     own: list[float] = field(default_factory=list)
-
-    def memory_mb(self) -> dict[str, float]:
-        """Memory at the start, after each third of the time, and at most."""
-        at = {"start": 0, "third": len(self.own) // 3, "two_thirds": 2 * len(self.own) // 3, "end": -1}
-        return {**{name: self.own[index] for name, index in at.items()}, "most_resident": max(self.resident)}
 
 
 class Watched:
@@ -210,9 +224,9 @@ def told(record: dict[str, Any]) -> str:
         f"{cpu['node_busy_ms_an_answer']:.0f} ms an answer then, {cpu['node_cores']:.2f} cores; "
         f"the viewers took {cpu['viewers_cores']:.2f} cores and clicked {1e3 * cpu['viewers_late_p99_s']:.0f} ms late "
         f"(99th percentile)",
-        f"memory of the node but for mapped files: {memory['start']:.0f} MB before, {memory['third']:.0f} and "
-        f"{memory['two_thirds']:.0f} MB after each third, {memory['end']:.0f} MB at the end; all of it at most "
-        f"{memory['most_resident']:.0f} MB",
+        f"memory of the node but for mapped files: {memory['before']:.0f} MB before, {memory['then']:.0f} MB at the "
+        f"end; in {CALM_S:g} s more of such clicks without a sweep {memory['calm']:.1f} MB, and in as many again "
+        f"{memory['calm_again']:.1f} MB; all of it at most {memory['most_resident']:.0f} MB",
         f"the sweep meanwhile: {sweep['seconds']:.0f} s, {sweep['requested_columns']} columns asked for again, "
         f"{sweep['dropped_bytes']} bytes dropped, {sweep['holes']} holes",
         f"a stalled reader costs the others {100 * stalled['cost']:.0f}%",

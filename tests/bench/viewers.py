@@ -9,6 +9,7 @@ As a program: reads one JSON object on standard input (see `Orders`), prints one
 from __future__ import annotations
 
 import asyncio
+import itertools
 import sys
 import time
 
@@ -26,7 +27,7 @@ GIVE_UP_S = 30.0
 class Orders(msgspec.Struct):
     """How many viewers open the newest scan, of whom how many click every `period_s` at one of the places.
 
-    stalled : viewers beside them that ask and never read.
+    stall_s : of every two such times, during the second there is a viewer more, that asks and never reads.
     """
 
     url: str
@@ -35,17 +36,19 @@ class Orders(msgspec.Struct):
     seconds: float
     places: list[tuple[float, float]]
     period_s: float = 0.5
-    stalled: int = 0
+    stall_s: float | None = None
     seed: int = 7
 
 
 class Report(msgspec.Struct):
     """latencies_s : from each click to the last byte of the first answer that came for it or for a later one.
 
+    clicked_s : when each of these clicks was made, from the first one of all on.
     late_s : how late each click was made.  cpu_s : processor time of the viewers themselves, while they clicked.
     """
 
     latencies_s: list[float]
+    clicked_s: list[float]
     superseded: int
     size_bytes: int
     late_s: list[float]
@@ -62,6 +65,7 @@ class Viewer:
         self._waiting: dict[int, float] = {}
         self._request = 0
         self.latencies_s: list[float] = []
+        self.clicked_s: list[float] = []
         self.late_s: list[float] = []
         self.superseded = 0
         self.size_bytes = 0
@@ -97,7 +101,8 @@ class Viewer:
                         continue
                     now_s = time.monotonic()
                     for older in [number for number in self._waiting if number <= request]:
-                        self.latencies_s.append(now_s - self._waiting.pop(older))
+                        self.clicked_s.append(self._waiting.pop(older))
+                        self.latencies_s.append(now_s - self.clicked_s[-1])
                     assert self._state is not None
                     self._state = msgspec.structs.replace(self._state, next_seq=next_seq)
                     await self._say(self._state)
@@ -132,19 +137,20 @@ async def view(orders: Orders) -> Report:
     connector = aiohttp.TCPConnector(limit=0)
     async with asyncio.timeout(orders.seconds + 4 * GIVE_UP_S), aiohttp.ClientSession(connector=connector) as http:
         viewers = [await _opened(http, orders.url) for _ in range(orders.viewers)]
-        stalled = [await _stall(http, orders.url) for _ in range(orders.stalled)]
         clickers = viewers[: orders.clickers]
         listeners = [asyncio.create_task(viewer.listen()) for viewer in viewers]
-        begun_s = time.process_time()
+        if orders.stall_s is not None:
+            listeners.append(asyncio.create_task(_stall(orders.url, orders.stall_s)))
+        begun_s, first_s = time.process_time(), time.monotonic()
         errors = await asyncio.gather(
             *(_click(viewer, number, orders) for number, viewer in enumerate(clickers)), return_exceptions=True
         )
         broken = [task.exception() for task in listeners if task.done()]
         for task in listeners:
             task.cancel()
-        del stalled
         return Report(
             [latency for viewer in clickers for latency in viewer.latencies_s],
+            [clicked_s - first_s for viewer in clickers for clicked_s in viewer.clicked_s],
             sum(viewer.superseded for viewer in clickers),
             sum(viewer.size_bytes for viewer in viewers),
             [late for viewer in clickers for late in viewer.late_s],
@@ -163,12 +169,16 @@ async def _stream(http: aiohttp.ClientSession, url: str) -> aiohttp.ClientWebSoc
     return await http.ws_connect(f"{url}/v1/stream", protocols=(m.PROTOCOL,), max_msg_size=1 << 26)
 
 
-async def _stall(http: aiohttp.ClientSession, url: str) -> Viewer:
-    """A viewer that asks for everything at once, and reads none of it."""
-    viewer = await _opened(http, url)
-    for place in np.linspace(0.05, 0.95, 50):
-        await viewer.click(float(place), 0.5)
-    return viewer
+async def _stall(url: str, stall_s: float) -> None:
+    """During every second stall_s, a viewer that asks for everything at once, and reads none of it."""
+    began_s = time.monotonic()
+    for turn in itertools.count(1):
+        await asyncio.sleep(max(began_s + (2 * turn - 1) * stall_s - time.monotonic(), 0.0))
+        async with aiohttp.ClientSession() as http:
+            viewer = await _opened(http, url)
+            for place in np.linspace(0.05, 0.95, 50):
+                await viewer.click(float(place), 0.5)
+            await asyncio.sleep(max(began_s + 2 * turn * stall_s - time.monotonic(), 0.0))
 
 
 async def _click(viewer: Viewer, number: int, orders: Orders) -> None:
