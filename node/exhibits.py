@@ -30,7 +30,7 @@ PICTURES_MAX = 64  # of some 10 KB
 GIVES_WAY = 10  # niceness of threads that compute for clients: a scanner does not wait
 MODELS_MAX = 8
 THREADS_A_LOOK = 2  # that is given its full time
-PAUSE_S = 0.02  # between two of a thousand tiles: a survey takes 20 s longer at most
+PAUSE_S = 0.06  # between two of a thousand tiles: a survey takes a minute longer at most
 T = TypeVar("T")
 Work = Literal["look", "fovea", "view", "picture", "other"]
 Key = tuple[str, CodecName, Profile]
@@ -216,7 +216,7 @@ class Exhibits:
         """Pause for a moment while looks wait: what is measured serves those to come."""
         until_s = time.monotonic() + PAUSE_S
         while self._waiting and time.monotonic() < until_s:
-            time.sleep(PAUSE_S / 8)
+            time.sleep(PAUSE_S / 16)
 
     def _build(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening:
         scan = self.library.open(scan_id)

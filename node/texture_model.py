@@ -218,6 +218,8 @@ class TextureModel:
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
         """Squared error per value of single blocks at qualities of their own; -1 is the first view. (n,) each"""
+        if (quality < 0).all():  # nearly always: nobody looked there before
+            return self._first_mse[rows, columns].astype(np.float64)
         measured = self._measured[TextureCodec.HTJ2K, 1]
         scale = np.array(measured.qualities, np.float64)
         above = np.clip(np.searchsorted(scale, quality), 1, scale.size - 1)
