@@ -15,7 +15,7 @@ import time
 
 log = logging.getLogger(__name__)
 
-CAPTURE_BY_S, GOODBYES_BY_S, AUDIT_BY_S, ALL_BY_S = 2.5, 3.5, 4.4, 4.8  # from the beginning of the end
+CAPTURE_BY_S, GOODBYES_BY_S, AUDIT_BY_S, ALL_BY_S = 2.5, 3.3, 4.0, 4.4  # from the beginning of the end
 
 
 class Ending:
