@@ -17,8 +17,6 @@ from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import aiohttp
-
 from client import RequestRefused, connect
 from client.session import Session
 from client.trust import look_at_certificate
@@ -114,7 +112,6 @@ class Hostility:
         """The figures. status : with which the node has ended, if it has."""
         if status is not None:
             self.failures.append(f"the node ended with status {status}")
-        self.look()
         return {
             "port": port, "messages": self.sent, "seconds": time.monotonic() - self._began_s, "served": self.served,
             "failures": self.failures[:20], "grown_mb": self._peak_mb - self._start_mb,
@@ -223,15 +220,13 @@ async def _attack_scanner(
     await _warm_up(target, hostility)
     with LyingScanner(line, hostility, payload_max):
         await _behave_until_done(target, hostility, _behave_and_sweep)
-    hostility.look()
+    hostility.look()  # what the honest sweep below takes, its picture say, is no growth
     line.hang_up()
     line.plug_in()
     with HonestScanner(line, payload_max):
         try:
             async with asyncio.timeout(SWEEP_S), target.connect() as session:
                 await _sweep(session)
-            async with aiohttp.request("GET", f"{target.url}/v1/scans/latest/picture") as answer:
-                await answer.read()  # it is drawn, so that its memory is not taken for growth
         except Exception as error:
             hostility.failures.append(f"with an honest scanner: {type(error).__name__}: {error}")
 
