@@ -149,6 +149,8 @@ def read_surface(path: Path, placing: Placing | None = None) -> Grid | Mesh:
     from exchange.mesh_file import SUFFIXES, Placing, read_mesh
     from exchange.points import Points
 
+    if path.suffix.lower() == ".zip":
+        raise ExchangeError("an archive: unpack it, and import the model.obj or other mesh that is in it")
     if path.suffix.lower() not in SUFFIXES:
         return read_scan(path).grid
     given = placing or Placing()
@@ -175,6 +177,8 @@ def _read_mesh(
     from exchange.points import Points, bin_points
     from exchange.star import close_mesh, star_centre
 
+    if path.suffix.lower() == ".zip":
+        raise ExchangeError("an archive: unpack it, and import the model.obj or other mesh that is in it")
     if path.suffix.lower() not in SUFFIXES:
         raise ExchangeError(f"no scan: expected an Echo file, .npz, {', '.join(SUFFIXES)}")
     if options.sweeps:

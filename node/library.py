@@ -20,6 +20,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from msgspec import structs
+
 from node import archive
 from node.axes import Axes
 from node.coarse import FIRST_VIEW_BYTES, Coarse, build_coarse, build_pyramid, fill_voids
@@ -143,7 +145,8 @@ class Library:
         """A scan as the list shows it. Raises LibraryError when unknown."""
         summary = self._known.get(scan_id)
         if summary is None:
-            raise LibraryError(f"no scan {scan_id[:40]!r} in this library")
+            short = f" ({PREFIX_MIN} digits of an id at least)" if len(scan_id) < PREFIX_MIN else ""
+            raise LibraryError(f"no scan {scan_id[:40]!r} in this library{short}")
         return summary
 
     def resolve(self, scan_id: str, geometries: Sequence[Geometry] = GEOMETRIES) -> str:
@@ -173,7 +176,7 @@ class Library:
 
     def add(self, grid: Grid, about: About) -> Scan:
         """Keep a grid, safe on disk before this returns. The same content again is the same scan, now the newest; where
-        it comes as a file, what is known of its sweep or of the scans it was made of stays.
+        it comes as a file, what is known of it stays: when it was made, its sweep, the scans it was made of.
 
         What clients need is derived while the disk is busy. Raises LibraryError when it cannot be written; then
         nothing of it is left.
@@ -201,9 +204,11 @@ class Library:
                 raise disk_error(f"cannot delete scan {scan_id}", error) from error
 
     def sidecar(self, scan_id: str) -> Sidecar:
-        """What is said of a scan. Raises LibraryError when the scan is unknown or that is damaged."""
-        self.summary(scan_id)
-        return read_sidecar(self.folder / scan_id)
+        """What is said of a scan. Until somebody renames it, its name is the one it came with.
+
+        Raises LibraryError when the scan is unknown or that is damaged.
+        """
+        return _called(read_sidecar(self.folder / scan_id), self.summary(scan_id))
 
     def annotate(self, scan_id: str, changes: Changes, by: str, revision: int | None = None) -> Sidecar:
         """Change what is said of a scan, durable before this returns. by : who does it.
@@ -214,7 +219,7 @@ class Library:
             summary = self.summary(scan_id)
             sidecar = change_sidecar(self.folder / scan_id, changes, by, time.time(), revision)
             self._know(_named(summary, sidecar))
-            return sidecar
+            return _called(sidecar, summary)
 
     def rename(self, scan_id: str, name: str, by: str) -> Sidecar:
         """Call a scan something else. Raises ValueError, LibraryError."""
@@ -341,6 +346,11 @@ def _named(summary: ScanSummary, sidecar: Sidecar) -> ScanSummary:
     return replace(summary, about=about, subject=sidecar.subject, body_site=sidecar.body_site)
 
 
+def _called(sidecar: Sidecar, summary: ScanSummary) -> Sidecar:
+    """A form that shows no name where there is one would save none."""
+    return sidecar if sidecar.name is not None else structs.replace(sidecar, name=summary.about.name)
+
+
 def _derive(grid: Grid, first_view_bytes: int) -> _Derived:
     coarse = build_coarse(grid, first_view_bytes)
     smaller = build_pyramid(grid.texture, math.floor(min(coarse.texture_spacing)))[1:]
@@ -360,6 +370,4 @@ def _come_again(known: About, about: About) -> About:
     """What is to be said of a scan that comes a second time: a file knows less of where it came from than we do."""
     if about.source != "import":
         return about
-    return replace(
-        known, created_unix_s=about.created_unix_s, name=about.name or known.name, note=about.note or known.note
-    )
+    return replace(known, name=about.name or known.name, note=about.note or known.note)

@@ -43,6 +43,12 @@ def test_a_file_of_another_kind_is_refused(name: str, tmp_path: Path) -> None:
         read_scan(tmp_path / name)
 
 
+def test_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "head.obj.zip").write_bytes(b"PK")
+    with pytest.raises(ExchangeError, match=r"head\.obj\.zip: an archive: unpack it"):
+        read_scan(tmp_path / "head.obj.zip")
+
+
 def test_a_refusal_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "head.echo").write_bytes(b"Cyberware\nNLG=3\nDATA=\n")
     with pytest.raises(ExchangeError, match=r"head\.echo: NLT: missing"):

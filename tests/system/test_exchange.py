@@ -99,7 +99,7 @@ def test_a_grid_goes_round_without_a_change(tmp_path: Path, capsys: pytest.Captu
         assert run("export", str(tmp_path / "vase.npz"), "--node", url) == 0
         assert run("import", str(tmp_path / "vase.npz"), "--node", f"{url}/", "--name", "again") == 0
         assert capsys.readouterr().out.endswith(f"scan {scan.id}, which the node had already; it is the newest now\n")
-        assert [kept.about.name for kept in library.scans()] == ["again"]
+        assert [kept.about for kept in library.scans()] == [About(0.0, name="again")], "it was swept when it was"
 
 
 def test_a_glb_goes_round_within_a_step(tmp_path: Path) -> None:

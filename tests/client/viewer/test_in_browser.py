@@ -147,6 +147,13 @@ def test_a_scan_is_renamed_and_deleted_after_being_asked(browser: Browser, tmp_p
             page.locator("summary:has-text('This scan')").click()
             page.get_by_role("textbox", name="Name").fill("back, left")
             page.get_by_role("textbox", name="Subject code").fill("P-17")
+            page.get_by_label("sets a pin").check()
+            click(page, 0.5, 0.5)
+            with page.expect_response(lambda answer: answer.request.method == "PATCH"):
+                page.get_by_label("Label of the new pin").fill("mole")
+                page.keyboard.press("Enter")
+            page.get_by_role("button", name="Show pin mole").wait_for(state="attached")
+            assert page.get_by_role("textbox", name="Subject code").input_value() == "P-17", "typed, not yet saved"
             page.get_by_role("button", name="Save").click()
             page.get_by_role("button", name="back, left P-17").wait_for()
             assert page.request.get(f"{line.url}/v1/scans").json()[0]["subject"] == "P-17", "what a list shows"

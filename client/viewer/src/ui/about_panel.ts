@@ -5,12 +5,17 @@ import { strings } from '../strings.ts';
 import { CopyDialog } from './copy_dialog.ts';
 import { h, refill, section } from './dom.ts';
 
+const FIELDS = ['name', 'subject', 'body_site'] as const;
+
 /** The scan that is open: its name and place, downloads, deletion. */
 export class AboutPanel {
   readonly element: HTMLElement;
   private readonly samples = h('p', { class: 'quiet' });
   private readonly downloads = h('ul', { class: 'downloads' });
-  private readonly inputs: Record<'name' | 'subject' | 'body_site', HTMLInputElement>;
+  private readonly inputs: Record<(typeof FIELDS)[number], HTMLInputElement>;
+  /** What the form was filled with last, and of which scan. */
+  private filled: Record<(typeof FIELDS)[number], string> = { name: '', subject: '', body_site: '' };
+  private scan = '';
   private readonly form: HTMLFormElement;
   private readonly dialog: HTMLDialogElement;
   private readonly remove: HTMLButtonElement;
@@ -22,8 +27,9 @@ export class AboutPanel {
     this.inputs = { name: text(200), subject: text(64), body_site: text(100) };
     const submit = (event: Event) => {
       event.preventDefault();
+      for (const field of FIELDS) this.inputs[field].value = this.inputs[field].value.trim();
       const { name, subject, body_site } = this.inputs;
-      save({ name: name.value.trim(), subject: subject.value.trim(), body_site: body_site.value.trim() });
+      save({ name: name.value, subject: subject.value, body_site: body_site.value });
     };
     this.form = h('form', { submit },
       h('label', {}, about.name, this.inputs.name), h('label', {}, about.subject, this.inputs.subject),
@@ -46,6 +52,8 @@ export class AboutPanel {
 
   show(info: ScanInfo): void {
     this.element.hidden = false;
+    if (info.id !== this.scan) this.fill({ name: '', subject: '', body_site: '' }, true);
+    this.scan = info.id;
     this.samples.textContent = strings.about.samples(info.width, info.height, info.textureWidth, info.textureHeight);
     refill(this.downloads, ...Object.entries(strings.about.formats).map(([format, name]) =>
       h('li', {}, h('a', { href: downloadPath(info.id, format), download: '' }, name))));
@@ -61,7 +69,15 @@ export class AboutPanel {
     this.form.hidden = this.remove.hidden = !sidecar || !mayChange;
     this.mayNot.hidden = mayChange;
     if (!sidecar) return;
-    for (const name of ['name', 'subject', 'body_site'] as const) this.inputs[name].value = sidecar[name] ?? '';
+    this.fill({ name: sidecar.name ?? '', subject: sidecar.subject, body_site: sidecar.body_site }, false);
+  }
+
+  /** What somebody has typed and not saved stays, unless it was of another scan. */
+  private fill(said: Record<(typeof FIELDS)[number], string>, anew: boolean): void {
+    for (const field of FIELDS) {
+      if (anew || this.inputs[field].value === this.filled[field]) this.inputs[field].value = said[field];
+    }
+    this.filled = said;
   }
 
   private async copy(): Promise<void> {
