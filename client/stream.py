@@ -11,7 +11,7 @@ from aiohttp import ClientWebSocketResponse, ClientWSTimeout, WSCloseCode, WSMsg
 
 from client.errors import NodeLost, RequestRefused
 from client.rest import ask
-from client.trust import UNTRUSTED, trouble
+from client.trust import UNTRUSTED, other_scheme, trouble
 from protocol import messages as m
 from protocol.errors import RemoteWireError
 from protocol.printable import printable
@@ -117,10 +117,12 @@ async def _connect(http: aiohttp.ClientSession, url: str) -> ClientWebSocketResp
     except aiohttp.WSServerHandshakeError as error:
         raise await _refusal(http, url, error.status) from error
     except aiohttp.ClientConnectorError as error:
+        if other := other_scheme(url, error):
+            raise NodeLost(f"no node at {url}: {other}") from error
         why = _reason(error.os_error)
         raise NodeLost(f"no node at {url}: {why}; check the address, or start one with `foveascan serve`") from error
     except (aiohttp.ClientError, OSError) as error:
-        raise NodeLost(f"{url} is no foveascan node: {error}") from error
+        raise NodeLost(f"{url} is no foveascan node: {other_scheme(url, error) or error}") from error
     if socket.protocol != m.PROTOCOL:
         await socket.close()
         raise RemoteWireError(f"{url} does not speak {m.PROTOCOL}: update the older of the two")

@@ -24,6 +24,7 @@ from protocol.errors import LocalWireError
 HANDSHAKE_S = 10
 SHUTDOWN_S = 1
 SHA256_DIGITS = 64
+WRONG_VERSION = "WRONG_VERSION_NUMBER"  # what OpenSSL says of an answer that is no TLS
 UNTRUSTED = (aiohttp.ServerFingerprintMismatch, aiohttp.ClientConnectorCertificateError)
 
 
@@ -95,4 +96,16 @@ def trouble(url: str, error: BaseException) -> NodeLost | NodeNotTrusted:
     if isinstance(error, aiohttp.ClientConnectorCertificateError):
         node = URL(url).origin()
         return NodeNotTrusted(f"{node} is not known here: pair with it, `foveascan join CODE --node {node}`")
+    if other := other_scheme(url, error):
+        return NodeLost(f"lost {url}: {other}")
     return NodeLost(f"lost {url}: {error or 'no answer in time'}; try again once the node is back")
+
+
+def other_scheme(url: str, error: BaseException) -> str:
+    """What to say where a node may serve TLS and was asked in plain HTTP, or the other way round; else ""."""
+    node = URL(url).origin()
+    if node.scheme == "http" and isinstance(error, aiohttp.ServerDisconnectedError):
+        return f"it hung up; if it serves TLS, it is {node.with_scheme('https')}"
+    if isinstance(error, aiohttp.ClientConnectorSSLError) and getattr(error.os_error, "reason", "") == WRONG_VERSION:
+        return f"it does not serve TLS; a node started with --insecure is {node.with_scheme('http')}"
+    return ""

@@ -34,6 +34,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     doctor.add_argument("--config", type=Path, metavar="FILE", help="settings the node runs with (TOML)")
     doctor.add_argument("--scanner", metavar="ADDRESS", help="the scanner's, instead of the one set there")
     doctor.add_argument("--library", metavar="DIR", help="folder the scans are kept in, instead of the one set there")
+    doctor.add_argument("--listen", metavar="HOST:PORT", help="address it serves, instead of the one set there")
     doctor.add_argument(
         "--link",
         metavar="ADDRESS",
@@ -98,7 +99,7 @@ def run_doctor(args: argparse.Namespace) -> int:
 
     from node.doctor import examine, examine_scanner
 
-    overrides = {"capture.scanner": args.scanner, "library.folder": args.library}
+    overrides = {"capture.scanner": args.scanner, "library.folder": args.library, "server.listen": args.listen}
     if args.link is None:
         findings = examine(args.config, overrides)
     else:

@@ -7,7 +7,6 @@ Whether a disk takes a file is tried with one that has no name.
 from __future__ import annotations
 
 import datetime as dt
-import errno
 import fcntl
 import http.client
 import os
@@ -261,7 +260,9 @@ def _check_key(server: settings.Server, library: Path, certificate: Path, accoun
 def check_disk(folder: Path, account: Account) -> Finding:
     """Whether the library can be written, and holds another sweep of the largest size."""
     there = _nearest(folder)
-    if not there.is_dir() or not account.may(there.stat(), READ | WRITE | SEARCH):
+    if not there.is_dir():
+        return Finding("disk", "problem", f"{there} is no folder", "choose another library.folder")
+    if not account.may(there.stat(), READ | WRITE | SEARCH):
         cure = f"chown -R {account.name} {folder}, or choose another library.folder"
         return Finding("disk", "problem", f"{account.name} may not write in {there}", cure)
     if os.statvfs(there).f_flag & os.ST_RDONLY:
@@ -379,21 +380,31 @@ def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:
     """Who listens at the node's address."""
     if server.port == 0:
         return "nobody"
-    line = _line_to(server)
+    who = _answer(server, server.insecure)
+    if who == "strange":  # a node that was told --insecure, or not to be: nobody need tell us
+        who = "node" if _answer(server, not server.insecure) == "node" else "other"
+    return who
+
+
+def _answer(server: settings.Server, insecure: bool) -> Literal["node", "other", "nobody", "strange"]:
+    """Who answers in plain HTTP, or over TLS. "strange": it does not speak that."""
+    line = _line_to(server, insecure)
     try:
         line.request("GET", "/healthz")
         answer = msgspec.json.decode(line.getresponse().read(ANSWER_BYTES_MAX))
         return "node" if isinstance(answer, dict) and "status" in answer else "other"
+    except (ssl.SSLError, ConnectionResetError):
+        return "strange"
     except OSError as error:
-        return "other" if error.errno is None or error.errno == errno.ECONNRESET else "nobody"
+        return "other" if error.errno is None else "nobody"
     except (http.client.HTTPException, ValueError, RecursionError):
         return "other"
     finally:
         line.close()
 
 
-def _line_to(server: settings.Server) -> http.client.HTTPConnection:
-    if server.insecure:
+def _line_to(server: settings.Server, insecure: bool) -> http.client.HTTPConnection:
+    if insecure:
         return http.client.HTTPConnection(server.host, server.port, timeout=ANSWER_S)
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE  # nothing is told, and little believed

@@ -29,6 +29,7 @@ QUALITY = 85
 ASPECT_MIN, ASPECT_MAX = 0.2, 3.0
 FIELD_OF_VIEW_RAD = math.radians(28)
 MARGIN = 1.08
+USUAL_MM = 500.0  # the scan is drawn as if it were so high
 ELEVATION_RAD = 0.1
 KEY, FILL = (np.array(light) / np.linalg.norm(light) for light in ((-0.45, 0.55, 0.8), (0.8, 0.05, 0.45)))
 WRAP = 0.25  # the key light reaches round
@@ -40,6 +41,7 @@ Float32Array = NDArray[np.float32]
 
 def draw_picture(coarse: Coarse) -> bytes:
     """WebP, HEIGHT high and as wide as lets the scan fill it both ways; transparent where nothing was measured."""
+    coarse = replace(coarse, spec=_usual_size(coarse.spec))
     radius_mm, bottom_mm, top_mm = _bounds(coarse)
     half = math.tan(FIELD_OF_VIEW_RAD / 2)
     aspect = min(max(2 * radius_mm / (top_mm - bottom_mm), ASPECT_MIN), ASPECT_MAX)
@@ -53,6 +55,12 @@ def draw_picture(coarse: Coarse) -> bytes:
         y = (1 - at[:, 1] / (at[:, 2] * half)) * height / 2
         _throw(picture, depth_mm, (y.astype(np.int64), x.astype(np.int64)), at[:, 2], _lit(colours, normals, at))
     return _packed(picture)
+
+
+def _usual_size(spec: GridSpec) -> GridSpec:
+    """A picture shows no size; with other rows, a pitch at a bound of what a GridSpec takes would be beyond it."""
+    scale = min(USUAL_MM / (spec.height * spec.pitch_mm), USUAL_MM / spec.step_mm)
+    return replace(spec, step_mm=scale * spec.step_mm, pitch_mm=scale * spec.pitch_mm, z_max_mm=0.0)
 
 
 def _bounds(coarse: Coarse) -> tuple[float, float, float]:

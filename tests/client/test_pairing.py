@@ -6,7 +6,7 @@ import asyncio
 import datetime as dt
 import ssl
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from pathlib import Path
 
 import pytest
@@ -16,9 +16,11 @@ from client.credentials import Credential, credentials_path, find_credential, ke
 from client.login import logged_in
 from client.transfer import fetch_scan
 from node.config import Server
+from node.library import Library
 from node.tls import FILE, RENEW_BEFORE, VALID, Tls, renew_own
 from protocol.errors import AccessError, LocalWireError, RemoteWireError
 from tests.node.entrance import Entrance, entrance
+from tests.node.served import served
 
 
 @pytest.fixture(autouse=True)
@@ -214,3 +216,20 @@ def test_a_damaged_file_is_named() -> None:
     credentials_path().write_text("{")
     with pytest.raises(AccessError, match="nodes.json"):
         find_credential("https://a:1")
+
+
+async def test_who_names_the_other_of_http_and_https_is_told(node: Entrance, tmp_path: Path) -> None:
+    plain, grid = node.url.replace("https", "http"), tmp_path / "scan.npz"
+    with pytest.raises(NodeLost, match=f"if it serves TLS, it is {node.url}"):
+        await fetch_scan(plain, "latest", grid, moved=lambda done, total: None)
+    with pytest.raises(NodeLost, match=f"if it serves TLS, it is {node.url}"):
+        async with connect(plain):
+            pass
+    with closing(Library(tmp_path / "other")) as library:
+        async with served(library) as (client, _):
+            url = f"https://127.0.0.1:{client.port}"
+            with pytest.raises(NodeLost, match=f"does not serve TLS; .* is http://127.0.0.1:{client.port}"):
+                await fetch_scan(url, "latest", grid, moved=lambda done, total: None)
+            with pytest.raises(NodeLost, match="does not serve TLS"):
+                async with connect(url):
+                    pass

@@ -184,6 +184,16 @@ def test_a_node_at_its_address_is_fine_another_program_is_not(body: bytes, state
         thread.join()
 
 
+def test_a_node_is_known_whether_it_serves_tls_or_not() -> None:
+    with answering(b'{"status": "ready"}') as node:
+        thread = Thread(target=node.serve_forever)
+        thread.start()
+        settled = settings.Server(listen=f"127.0.0.1:{node.server_port}")
+        assert doctor._who_answers(settled) == "node", "started with --insecure, of which the settings say nothing"
+        node.shutdown()
+        thread.join()
+
+
 def test_a_program_that_says_nothing_is_another_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "ANSWER_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -205,6 +215,12 @@ def test_a_disk_is_judged_by_what_a_sweep_takes(tmp_path: Path, monkeypatch: pyt
         found.append(doctor.check_disk(tmp_path / "not" / "there", ROOT))
     assert states(*found) == ["problem", "warning", "ok"]
     assert str(tmp_path) in found[0].found
+
+
+def test_a_file_is_no_library(tmp_path: Path) -> None:
+    (tmp_path / "scans").write_text("mine")
+    finding = doctor.check_disk(tmp_path / "scans", ROOT)
+    assert (finding.found, finding.cure) == (f"{tmp_path}/scans is no folder", "choose another library.folder")
 
 
 def test_a_folder_the_node_may_not_write_is_a_problem(tmp_path: Path) -> None:

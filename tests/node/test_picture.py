@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -65,6 +66,15 @@ def test_it_shows_the_front_the_right_way_round(geometry: Geometry) -> None:
     assert left[0] > 100 and right[0] > 100 and max(left[2], right[2]) < 60, "red, not the blue behind"
     assert left[1] > right[1] + 40
     assert (picture[height // 4 : -height // 4, width // 3 : -width // 3, 3] == 255).all(), "there are no holes"
+
+
+@pytest.mark.parametrize("scale", [1e-6 * 96 / 120, 1e3 * 96 / 120])
+def test_a_scan_at_a_bound_of_its_pitch_looks_like_any(scale: float) -> None:
+    usual = grid_of("cylinder")
+    spec = replace(usual.spec, step_mm=max(1e-6, 0.01 * scale), pitch_mm=scale * usual.spec.pitch_mm, z_max_mm=0.0)
+    steps = np.full_like(usual.range_steps, round(RADIUS_MM * scale / spec.step_mm))
+    picture = drawn(Grid(spec, steps, usual.texture))
+    assert np.abs(picture.astype(int) - drawn(usual)).mean() < 2
 
 
 def test_nothing_measured_is_transparent() -> None:

@@ -20,7 +20,7 @@ export const strings = {
   link: {
     connecting: 'Connecting…',
     ready: (node: string) => `Connected to ${node}`,
-    lost: (reason: string, seconds: number) => `No connection: ${reason}. Next try in ${seconds} s.`,
+    lost: (reason: string, seconds: number) => `No connection: ${reason}${reason.endsWith('?') ? '' : '.'} Next try in ${seconds} s.`,
     again: 'Try now',
     cut: 'the connection was cut',
     unreachable: 'the node does not answer; is it switched on, and are you on its network?',
