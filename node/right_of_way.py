@@ -12,13 +12,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from drivers.scanner import SweepEvent, SweepFinished, SweepInterrupted
+from drivers.scanner import SweepEvent, SweepFinished, SweepInterrupted, SweepStarted
 from protocol.scanner_messages import RangeColumn, TextureColumn
 
 _COLUMNS = (RangeColumn, TextureColumn)
 
 FAST_BYTES_S = 4e6
 PORTION_BYTES = 1 << 18
+TELLING_BYTES = 1 << 20  # fewer do not tell how fast a sweep is: a thread that was kept waiting finds as many at once
 STILL_S = 0.25  # a fast sweep that brings nothing for longer takes the way no more
 WAIT_S = 0.25
 REST = 3.0  # a pause is at least that many times as long as what was computed before it
@@ -31,8 +32,8 @@ class RightOfWay:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._since_s = 0.0
-        self._bytes = 0
+        self._began_s = 0.0
+        self._bytes = self._measured_bytes = 0
         self._is_fast = False
         self._taken_until_s = 0.0
         self._rest_until_s = 0.0
@@ -41,18 +42,24 @@ class RightOfWay:
     def watch(self, event: SweepEvent) -> None:
         """Take in what happens in a sweep; for the capture thread."""
         if isinstance(event, _COLUMNS):
+            if not self._bytes:
+                self._began_s = self._clock()
             self._bytes += len(event.data)
-            if self._bytes >= PORTION_BYTES:
+            if self._bytes >= self._measured_bytes + PORTION_BYTES:
                 self._measure(self._clock())
-        elif isinstance(event, SweepFinished | SweepInterrupted):
+        elif isinstance(event, SweepStarted | SweepFinished | SweepInterrupted):
+            self._bytes = self._measured_bytes = 0
             self._is_fast, self._taken_until_s = False, 0.0
 
     def _measure(self, now_s: float) -> None:
-        """Another portion has come. A sweep that was fast once counts as fast to its end: it may be we who slow it."""
-        self._is_fast |= (now_s - self._since_s) * FAST_BYTES_S < self._bytes
+        """Another portion has come. All of a sweep tells how fast it is: a part that was kept waiting comes at once.
+
+        A sweep that was fast once counts as fast to its end: it may be we who slow it.
+        """
+        self._measured_bytes = self._bytes
+        self._is_fast |= self._bytes >= TELLING_BYTES and (now_s - self._began_s) * FAST_BYTES_S < self._bytes
         if self._is_fast:
             self._taken_until_s = now_s + STILL_S
-        self._since_s, self._bytes = now_s, 0
 
     @property
     def is_taken(self) -> bool:

@@ -49,6 +49,25 @@ def test_a_sweep_that_was_fast_goes_first_to_its_end_however_slow_it_gets(end: S
     assert not way.is_taken
 
 
+def test_columns_that_were_kept_waiting_and_come_at_once_make_no_fast_sweep() -> None:
+    clock = Clock()
+    way = RightOfWay(clock)
+    for _ in range(3):
+        pass_columns(way, clock, 0.25 * FAST_BYTES_S)
+        clock.now_s += 4 * PORTION_BYTES / (0.25 * FAST_BYTES_S)  # of what came meanwhile nothing was read
+        pass_columns(way, clock, 35e6)
+        assert not way.is_taken
+
+
+def test_a_sweep_after_another_is_measured_anew() -> None:
+    clock = Clock()
+    way = RightOfWay(clock)
+    pass_columns(way, clock, 300e3)
+    way.watch(SweepFinished(SweepReport()))
+    pass_columns(way, clock, 35e6)
+    assert way.is_taken
+
+
 def test_without_columns_nobody_waits_for_anybody() -> None:
     way, inside = RightOfWay(), threading.Barrier(2, timeout=5)
 
