@@ -25,7 +25,6 @@ from protocol.region import Region
 from protocol.strips import Strips, build_strips, image_shape, join_parts, select_strips
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
-BAND_ROWS = 4 * TEXTURE_BLOCK  # of a sphere whose texels count as equally wide
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -187,8 +186,8 @@ def _bands(selection: Selection) -> Iterator[tuple[slice, float]]:
     if not shape.sphere:
         yield slice(0, rows), 1.0
         return
-    for top in range(0, rows, BAND_ROWS):
-        bottom = min(top + BAND_ROWS, rows)
+    for top in range(0, rows, TEXTURE_BLOCK):
+        bottom = min(top + TEXTURE_BLOCK, rows)
         yield slice(top, bottom), shape.stride * math.sin(math.pi * (first + (top + bottom) / 2) / shape.height)
 
 
