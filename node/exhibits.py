@@ -216,7 +216,7 @@ class Exhibits:
         """Pause for a moment while looks wait: what is measured serves those to come."""
         until_s = time.monotonic() + PAUSE_S
         while self._waiting and time.monotonic() < until_s:
-            time.sleep(PAUSE_S / 16)
+            time.sleep(PAUSE_S / 16)  # looked at, not waited for: the event loop shall not stop to tell us
 
     def _build(self, scan_id: str, codec: CodecName, profile: Profile) -> Opening:
         scan = self.library.open(scan_id)
