@@ -144,8 +144,9 @@ def _bar(args: argparse.Namespace, what: str) -> Iterator[Moved]:
 
 def _add_geometry(parser: argparse.ArgumentParser) -> None:
     geometry = parser.add_argument_group("geometry", "whether it is seen from an axis, or from a centre inside it")
-    text = "(a grid as it is; a mesh as a sphere if it is closed); sphere says why one cannot be made"
-    geometry.add_argument("--geometry", choices=("cylinder", "sphere"), help=text)
+    geometry.add_argument(
+        "--geometry", choices=("cylinder", "sphere"), help="(a grid as it is; a mesh as a sphere if it is closed)"
+    )
     add_closing(geometry, Path, "FILE")
 
 

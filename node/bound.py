@@ -11,8 +11,8 @@ from functools import partial
 
 from node.classic import ClassicCoded, ClassicState
 from node.classic_planner import ClassicUpdate, plan_classic
-from node.coded import Coded
-from node.foveate import Update, plan_update
+from node.coded import Coded, Packed
+from node.foveate import Planned, Update, plan_update
 from node.library import Scan
 from node.range_model import RangeModel
 from node.refine_texture import mse_of_db
@@ -24,6 +24,8 @@ from protocol.errors import LatticeError, RemoteWireError
 from protocol.holdings import ChannelHoldings
 from protocol.lattice import Channel
 from protocol.sphere import region_on
+
+AnyUpdate = Update | Planned | ClassicUpdate
 
 
 @dataclass(slots=True, eq=False)
@@ -68,9 +70,9 @@ class Bound:
         better = plan("htj2k")
         return replace(better, encodes=update.encodes + better.encodes)
 
-    def take(self, update: Update | ClassicUpdate, look: m.Look) -> list[bytes]:
+    def take(self, update: AnyUpdate, look: m.Look) -> list[bytes]:
         """Count an update as sent; returns its refinements on the wire, in order."""
-        coded: tuple[Coded | ClassicCoded, ...] = update.coded
+        coded: tuple[Coded | Packed | ClassicCoded, ...] = update.coded
         refinements = [one.refinement(self.epoch, seq, look.request) for seq, one in enumerate(coded, self.next_seq)]
         self.state = update.state
         self.next_seq += len(coded)
@@ -130,7 +132,7 @@ def _falls_short(update: Update, look: m.Look) -> bool:
     return update.reason == "complete" and update.texture_db is not None and update.texture_db < look.texture_db
 
 
-def updated(look: m.Look, next_seq: int, update: Update | ClassicUpdate, node_s: float) -> m.Updated:
+def updated(look: m.Look, next_seq: int, update: AnyUpdate, node_s: float) -> m.Updated:
     """What ends an update, in few digits that promise no more than the truth: errors rounded up, PSNR down."""
     return m.Updated(
         look.request,

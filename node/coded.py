@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import groupby, pairwise
 from typing import NamedTuple
@@ -115,6 +115,22 @@ class Coded:
         """Record in a client's state that it holds this now."""
         for strip in self.strips:
             state.holdings.channels[self.channel].adopt(strip.selection.lattice, strip.adopted, self.rank)
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """The same without what only planning needs, so that it is quickly handed from process to process."""
+
+    unnumbered: Refinement
+
+    @classmethod
+    def of(cls, coded: Coded) -> Packed:
+        """What of it travels."""
+        return cls(coded.refinement(0, 0, 0))
+
+    def refinement(self, epoch: int, seq: int, look: int) -> Refinement:
+        """The wire record."""
+        return replace(self.unnumbered, epoch=epoch, seq=seq, look=look)
 
 
 def message_overhead(parameters: Parameters) -> int:

@@ -77,7 +77,7 @@ class Server(Struct, frozen=True, forbid_unknown_fields=True):
     max_clients: Annotated[int, Meta(ge=1, le=4096)] = 64
     trusted_proxies: Annotated[tuple[str, ...], Meta(max_length=16)] = ()  # your addresses, believed for whom they ask
     shared_cache: bool = False  # let a cache of yours keep foveae, for a day at most
-    encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode
+    encode_workers: Annotated[int, Meta(ge=1, le=64)] = 2  # threads that plan and encode, and processes
 
     def __post_init__(self) -> None:
         host, _ = _split_listen(self.listen)
@@ -224,9 +224,7 @@ def load_config(path: Path | None = None, overrides: Mapping[str, object] | None
         return msgspec.convert(settings, Config)
     except msgspec.ValidationError as problem:
         what = _in_our_words(str(problem))
-        if what.partition(":")[0] in given:
-            raise UsageError(what) from None
-        raise ConfigError(f"{path}: {what}" if path else what) from None
+        raise (UsageError if what.partition(":")[0] in given else ConfigError)(what) from None
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

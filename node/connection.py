@@ -21,9 +21,8 @@ from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
 from node.audit import Audit, Who
 from node.auth import Login
-from node.bound import Bound, updated
+from node.bound import AnyUpdate, Bound, updated
 from node.bucket import Bucket
-from node.classic_planner import ClassicUpdate
 from node.exhibits import Exhibits
 from node.foveate import Update
 from node.live import Live, Place
@@ -315,7 +314,7 @@ class Connection:
 
     async def _planned(
         self, bound: Bound | None, look: m.Look, hurried: bool
-    ) -> Update | ClassicUpdate | m.Refused | m.Updated:
+    ) -> AnyUpdate | m.Refused | m.Updated:
         """What answers a look, or what is said instead."""
         if bound is None:
             why = "the scan was deleted: open another" if self._is_gone else "open a scan first"
@@ -330,7 +329,7 @@ class Connection:
         self._gave_way = update.reason == "superseded"
         return self._superseded(look) if self._gave_way or not still_wanted else update
 
-    async def _plan(self, bound: Bound, look: m.Look, hurried: bool) -> Update | ClassicUpdate:
+    async def _plan(self, bound: Bound, look: m.Look, hurried: bool) -> AnyUpdate:
         budget = look.max_bytes
         if look.max_wait_s is not None:
             affordable = self._rate.budget_bytes(look.max_wait_s)
@@ -346,13 +345,19 @@ class Connection:
             self._metrics.hurried()
         pool = None if hurried else self._exhibits.idle_pool()
 
-        def job() -> Update | ClassicUpdate:
+        def job() -> AnyUpdate:
+            if hurried:
+                planned = self._exhibits.planners.plan(
+                    bound, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried
+                )
+                if planned is not None:
+                    return planned
             update = bound.plan(look, self._codecs, budget, superseded, models[0], quick, models[1], hurried, pool)
             return update.settled() if pool is None and isinstance(update, Update) else update
 
         return await self._exhibits.work(job, "look")
 
-    async def _send_update(self, bound: Bound, look: m.Look, update: Update | ClassicUpdate, spent_s: float) -> None:
+    async def _send_update(self, bound: Bound, look: m.Look, update: AnyUpdate, spent_s: float) -> None:
         if update.coded:
             self._acknowledged.clear()
             self._begin_timing()

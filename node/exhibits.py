@@ -19,6 +19,7 @@ from node.classic import ClassicView, build_classic_view
 from node.first_view import FirstView, build_first_view, scan_info, texture_as_seen
 from node.library import Library, Scan
 from node.picture import draw_picture
+from node.planners import Planners
 from node.range_model import RangeModel
 from node.right_of_way import RightOfWay
 from node.texture_model import TextureModel
@@ -52,6 +53,7 @@ class Exhibits:
         self._pool = ThreadPoolExecutor(workers, "encode", _give_way)
         self._turns, self._waiting, self._planned = asyncio.Semaphore(workers + 1), 0, 0
         self._workers = workers
+        self.planners = Planners(workers, library.folder)
         self._encoded: Callable[[Work, float, float], object] = lambda of, waited_s, took_s: None
         self._working = 0
         self._moved_s = 0.0
@@ -120,6 +122,7 @@ class Exhibits:
             del self._views[key]
         self._models.pop(scan_id, None)
         self._pictures.pop(scan_id, None)
+        self._pool.submit(self.planners.forget, scan_id)
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[bool]:
@@ -139,6 +142,11 @@ class Exhibits:
         finally:
             self._planned -= 1
             self._turns.release()
+
+    def expect_looks(self, streams: int) -> None:
+        """So many streams are there: where each look of theirs may find others waiting, have processes for them."""
+        if streams > self._workers:
+            self._pool.submit(self.planners.start)
 
     def tell(self, encoded: Callable[[Work, float, float], object]) -> None:
         """Have somebody told of every job: what it was for, how long it waited and took [s], in the event loop."""
@@ -181,6 +189,7 @@ class Exhibits:
     def close(self) -> None:
         """Let running jobs end, start no more."""
         self._closing.set()
+        self.planners.close()
         self._surveyor.shutdown(cancel_futures=True)
         self._pool.shutdown(cancel_futures=True)
 

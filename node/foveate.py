@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from node.beside import both
-from node.coded import Coded, framed
+from node.coded import Coded, Packed, framed
 from node.library import Scan
 from node.quality import Encodes, Superseded
 from node.range_model import RangeModel
@@ -82,6 +82,24 @@ class Update:
     def wire_bytes(self) -> int:
         """What the update takes on the wire, reply and carrier included."""
         return REPLY_BYTES + sum(coded.wire_bytes for coded in self.coded)
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """An update that another process has planned and settled; fields as of Update."""
+
+    coded: tuple[Packed, ...]
+    state: ClientState
+    reason: Reason
+    error_max_mm: float | None
+    texture_db: float | None
+    encodes: int
+
+    @classmethod
+    def of(cls, update: Update) -> Planned:
+        """What of a settled update is handed over."""
+        coded = tuple(Packed.of(one) for one in update.coded)
+        return cls(coded, update.state, update.reason, update.error_max_mm, update.texture_db, update.encodes)
 
 
 def plan_update(

@@ -35,6 +35,7 @@ def examine_health(
     library: Library,
     parts: Mapping[str, Beating],
     audit_trouble: str = "",
+    planning_trouble: str = "",
     certificate_end_unix_s: float | None = None,
     now_unix_s: float = 0.0,
 ) -> Health:
@@ -49,6 +50,7 @@ def examine_health(
         *_of_library(library),
         *filter(None, (library.axes.damaged,)),
         *((f"the audit log cannot be written: {audit_trouble}",) if audit_trouble else ()),
+        *filter(None, (planning_trouble,)),
         *_of_certificate(certificate_end_unix_s, now_unix_s),
     )
     if reasons:

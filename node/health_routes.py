@@ -99,7 +99,8 @@ class HealthRoutes:
             parts["the capture thread"] = self._capture
         ends_s = self._tls.ends_unix_s if self._tls else None
         library, now_s = self._exhibits.library, time.time()
-        return examine_health(self._status(), library, parts, self._audit.trouble, ends_s, now_s)
+        planning = self._exhibits.planners.trouble
+        return examine_health(self._status(), library, parts, self._audit.trouble, planning, ends_s, now_s)
 
     def _now(self) -> Now:
         library, status = self._exhibits.library, self._status()
@@ -113,6 +114,8 @@ class HealthRoutes:
             connections=self._gate.connections,
             turned_away=self._gate.turned_away,
             queued=self._exhibits.queued,
+            planners=self._exhibits.planners.running,
+            planners_died=self._exhibits.planners.died,
             scans=len(library.scans()),
             interrupted=len(library.sweeps.interrupted()),
             free_bytes=disk.f_bavail * disk.f_frsize,

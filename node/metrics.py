@@ -33,6 +33,8 @@ class Now:
     connections: int
     turned_away: int
     queued: int
+    planners: int
+    planners_died: int
     scans: int
     interrupted: int
     free_bytes: int
@@ -144,6 +146,7 @@ class _Asked(Collector):
             ("rerequested_columns", "Columns asked for again", c.requested_columns),
             ("dropped_frames", "Stretches of the scanner's line that were no sound frame", c.dropped_frames),
             ("dropped_bytes", "Bytes of these", c.dropped_bytes),
+            ("planning_processes_died", "Processes that planned looks, and died", now.planners_died),
             ("connections_closed", "Connections closed because there were too many", now.turned_away),
         ):
             yield CounterMetricFamily(f"foveascan_{name}", text, value=count)
@@ -152,6 +155,7 @@ class _Asked(Collector):
             ("streams", "Clients with a stream", now.streams),
             ("connections", "Connections, streams among them", now.connections),
             ("encode_queue", "Jobs that wait for an encoding thread", now.queued),
+            ("planning_processes", "Processes that plan looks where several wait", now.planners),
             ("scans", "Scans in the library", now.scans),
             ("interrupted_sweeps", "Interrupted sweeps in the library", now.interrupted),
             ("disk_free_bytes", "Free where the library is", now.free_bytes),

@@ -367,6 +367,7 @@ class NodeServer:
         )  # fmt: skip
         connection = Connection(stream, request[LOGIN], request.remote or "", house)
         self._connections[connection] = line
+        self._exhibits.expect_looks(len(self._connections))
         try:
             await connection.run()
         finally:

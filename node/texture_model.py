@@ -9,7 +9,6 @@ update that is sent. Of a sphere the rows' own texels are coded, zone by zone of
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
@@ -185,7 +184,6 @@ class TextureModel:
         self._first_mse = np.full(self._cells, 255.0**2, np.float32)
         if first_view is not None:
             self._first_mse[:] = _cell_errors(texture, first_view)
-        self._lock = threading.Lock()
         self._stride = ring_strides(width, height, CELL) if sphere else np.ones(self._cells[0], np.int64)
         self._measured = {
             (codec, p): _Measured(codec, p, self._cells) for codec in QUALITIES for p in SPACINGS
@@ -230,9 +228,8 @@ class TextureModel:
     def learn(self, codec: TextureCodec, p: int, expected_bytes: float, actual_bytes: int) -> None:
         """Take note of what a patch really took."""
         if expected_bytes > 0 and actual_bytes > 0:
-            with self._lock:
-                ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
-                self._measured[codec, p].bias *= ratio**BIAS_WEIGHT
+            ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
+            self._measured[codec, p].bias *= ratio**BIAS_WEIGHT  # two threads at once: one of them is not learned from
 
 
 def _shifted(qualities: tuple[int, ...], values: FloatArray, by: FloatArray) -> FloatArray:

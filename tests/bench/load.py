@@ -32,7 +32,6 @@ WARM_CLICKS, IDLE_CLICKS = 8, 40
 STALL_CLICKERS, STALL_S, STALL_TURNS = 4, 2.0, 7
 SAMPLE_S = 0.5
 CALM_S = 20.0  # in which a node gives freed memory back once
-PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 SETTINGS = """
 [capture]
 scanner = "{scanner}"
@@ -175,10 +174,10 @@ class Watching:
 
 
 class Watched:
-    """A process whose memory and processor time are looked at."""
+    """A process and those that it has started, whose memory and processor time are looked at."""
 
     def __init__(self, pid: int) -> None:
-        self._folder = Path(f"/proc/{pid}")
+        self._pid = pid
 
     @contextmanager
     def watching(self) -> Iterator[Watching]:
@@ -202,13 +201,25 @@ class Watched:
             watching.seconds, watching.cpu_s = time.monotonic() - began_s, self._cpu_s() - began_cpu_s
 
     def _look(self, watching: Watching) -> None:
-        resident, shared = (int(pages) for pages in (self._folder / "statm").read_text().split()[1:3])
-        watching.resident.append(resident * PAGE_BYTES / 1e6)
-        watching.own.append((resident - shared) * PAGE_BYTES / 1e6)
+        resident = own = 0
+        for folder in self._folders():
+            fields = dict(line.split()[:2] for line in (folder / "smaps_rollup").read_text().splitlines()[1:])
+            resident += int(fields["Pss:"])  # what processes share counts once
+            own += int(fields["Pss_Anon:"]) + int(fields["Pss_Shmem:"])
+        watching.resident.append(resident * 1024 / 1e6)
+        watching.own.append(own * 1024 / 1e6)
 
     def _cpu_s(self) -> float:
-        user, system = (self._folder / "stat").read_text().rpartition(")")[2].split()[11:13]
-        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+        ticks = 0
+        for folder in self._folders():
+            user, system = (folder / "stat").read_text().rpartition(")")[2].split()[11:13]
+            ticks += int(user) + int(system)
+        return ticks / os.sysconf("SC_CLK_TCK")
+
+    def _folders(self) -> list[Path]:
+        listed = Path(f"/proc/{self._pid}/task").glob("*/children")
+        children = [child for path in listed for child in path.read_text().split()]
+        return [Path(f"/proc/{pid}") for pid in (self._pid, *children)]
 
 
 def told(record: dict[str, Any]) -> str:

@@ -47,6 +47,7 @@ NEEDS_NONE = {
     "node/shared.py may_hand_out": "a pattern, which `original-uri` is matched with",
     "node/sidecar.py _checked": "what we have just written",
     "node/tls.py _names": "this machine's names",
+    "node/tray.py take": "what a process of ours has laid there",
     "protocol/codec_htj2k.py _strip": "what the encoder has just written",
     "protocol/codec_jpeg.py _strip": "the same",
     "protocol/codec_lift.py _expected_bytes": "the same",

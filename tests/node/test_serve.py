@@ -206,7 +206,7 @@ async def test_health_says_when_the_audit_log_cannot_be_written(tmp_path: Path, 
 def test_health_says_when_the_certificate_ends(
     tmp_path: Path, disk: SimpleNamespace, left_s: float, reasons: tuple[str, ...]
 ) -> None:
-    said = health.examine_health(CaptureStatus("no scanner"), Library(tmp_path), {}, "", 1e9 + left_s, 1e9)
+    said = health.examine_health(CaptureStatus("no scanner"), Library(tmp_path), {}, "", "", 1e9 + left_s, 1e9)
     assert said.reasons == reasons
 
 

@@ -138,7 +138,6 @@ export class Comparison {
       case 'opened':
       case 'restored':
       case 'patch':
-      case 'patched':
       case 'updated':
       case 'refused':
       case 'traffic':
