@@ -28,11 +28,20 @@ from protocol.reconstruct import (
     content_hashes,
     paste,
     range_patch,
-    texture_patch,
 )
 from protocol.refinement import Generator, Refinement
 from protocol.sphere import default_mesh, ranges_on, vectors
-from protocol.strips import Strip, Strips, blocks_of, build_strips, image_shape, samples_of, select_strips, split_parts
+from protocol.strips import (
+    Strip,
+    Strips,
+    blocks_of,
+    build_strips,
+    image_shapes,
+    samples_of,
+    select_strips,
+    split_parts,
+    texture_patches,
+)
 
 Codec = TypeVar("Codec", RangeCodec, TextureCodec)
 Array = TypeVar("Array", NDArray[np.float32], StepArray, ImageArray)
@@ -232,10 +241,10 @@ def _range_patches(refinement: Refinement, strips: Strips) -> list[StepArray]:
 
 def _texture_patches(refinement: Refinement, strips: Strips) -> list[ImageArray]:
     """The same of texture."""
-    parts = zip(_selections(strips), split_parts(refinement.payload, len(strips)), strict=True)
-    codec = _codec(TextureCodec, refinement.codec)
-    images = ((one, texture_of(refinement, image_shape(one, codec), payload)) for one, payload in parts)
-    return [texture_patch(one, image[: one.sample_shape[0]]) for one, image in images]
+    shapes = image_shapes(strips, _codec(TextureCodec, refinement.codec))
+    payloads = split_parts(refinement.payload, len(shapes))
+    images = [texture_of(refinement, shape, payload) for shape, payload in zip(shapes, payloads, strict=True)]
+    return texture_patches(strips, images)
 
 
 def texture_of(refinement: Refinement, shape: tuple[int, int], payload: bytes | None = None) -> ImageArray:
@@ -275,7 +284,7 @@ def _only_finer(strip: Strip, held: ChannelHoldings, rank: int) -> Strip:
     rows, columns = np.flatnonzero(adopted.any(1)), np.flatnonzero(adopted.any(0))
     finer = adopted & held.adoptable(selection.lattice, rank)
     core = finer[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return Strip(replace(selection, adopted=core), finer)
+    return replace(strip, selection=replace(selection, adopted=core), adopted=finer)
 
 
 def _read_only(array: Array) -> Array:

@@ -40,11 +40,10 @@ class Part:
     """What one strip of a refinement carries, encoded.
 
     mask, decoded, void : range only, the samples as a client decodes them and which cells of its patch are void.
-    payload, patch : texture only, the patch is what a client makes of it; None where nobody measured it.
+    patch : texture only, what a client makes of it; None where nobody measured it.
     """
 
     strip: Strip
-    payload: bytes = b""
     mask: bytes = b""
     decoded: StepArray | None = None
     void: BoolArray | None = None

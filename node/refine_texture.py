@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from node.coded import Coded, Part, fewest_strips, own_inside, region_lattice, rho_of
 from node.library import Scan
+from node.polar import PolarTexture, polar_samples
 from node.sample import texture_samples
 from node.state import ClientState
 from node.texture_model import SPACINGS
@@ -22,7 +23,16 @@ from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import CodecName, TextureParameters
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
-from protocol.strips import Strips, build_strips, image_shape, join_parts, select_strips
+from protocol.strips import (
+    Strips,
+    build_strips,
+    image_shape,
+    image_shapes,
+    join_parts,
+    select_strips,
+    split_parts,
+    texture_patches,
+)
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
@@ -91,13 +101,16 @@ def code_texture_strips(
     strips: Strips, images: Sequence[ImageArray], quality: float, codec: TextureCodec, *, quick: bool
 ) -> Coded:
     """Encode what was selected, as it travels."""
-    payloads = encode_textures(images, codec, quality, quick=quick)
-    parts = tuple(Part(strip, payload) for strip, payload in zip(strips, payloads, strict=True))
-    return Coded(parts, texture_rank(int(quality)), quality, codec, join_parts(payloads))
+    payload = join_parts(encode_textures(images, codec, quality, quick=quick))
+    return Coded(tuple(Part(strip) for strip in strips), texture_rank(int(quality)), quality, codec, payload)
 
 
-def texture_images(scan: Scan, strips: Strips, codec: TextureCodec) -> list[ImageArray]:
-    """The texels of each strip as they travel, whatever the quality."""
+def texture_images(
+    scan: Scan, strips: Strips, codec: TextureCodec, maps: PolarTexture | None = None
+) -> list[ImageArray]:
+    """The texels of each image as they travel, whatever the quality.   maps : of the scan's texture, if there are."""
+    if (polar := strips[0].polar) is not None:
+        return [polar_samples(scan.texture, strips, polar) if maps is None else maps.image(strips, polar)]
     return [_image(scan, strip.selection, codec) for strip in strips]
 
 
@@ -151,15 +164,14 @@ def _block_errors(scan: Scan, part: Part) -> NDArray[np.float32]:
 
 def measured(coded: Coded) -> Coded:
     """A refinement with the texture that a client makes of it."""
-    return replace(coded, parts=tuple(_measured(part, coded) for part in coded.parts))
-
-
-def _measured(part: Part, coded: Coded) -> Part:
-    if part.patch is not None:
-        return part
-    selection, codec = part.selection, TextureCodec(coded.codec)
-    image = decode_texture(part.payload, codec, int(coded.quality), image_shape(selection, codec))
-    return replace(part, patch=texture_patch(selection, image[: selection.sample_shape[0]]))
+    if coded.parts[0].patch is not None:
+        return coded
+    codec, quality = TextureCodec(coded.codec), int(coded.quality)
+    shapes = image_shapes(coded.strips, codec)
+    payloads = zip(split_parts(coded.payload, len(shapes)), shapes, strict=True)
+    patches = texture_patches(coded.strips, [decode_texture(data, codec, quality, shape) for data, shape in payloads])
+    parts = zip(coded.parts, patches, strict=True)
+    return replace(coded, parts=tuple(replace(part, patch=patch) for part, patch in parts))
 
 
 class Compared:

@@ -93,10 +93,10 @@ def void_cells(scan: Scan, selection: Selection) -> BoolArray:
 def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
     """Mean colour of each transmitted cell. sample_shape + (3,) uint8; smoothly continued where nobody looks."""
     texels = _cell_means(scan, selection)
-    return texels if selection.adopted.all() else _smoothed(texels, _stencil(selection))
+    return texels if selection.adopted.all() else smoothed(texels, _stencil(selection))
 
 
-def _smoothed(texels: ImageArray, seen: BoolArray) -> ImageArray:
+def smoothed(texels: ImageArray, seen: BoolArray) -> ImageArray:
     """Texels with those unseen taken from means of what is seen round them, ever wider ones: what a wavelet codes in
     few bytes. The nearest seen texel's colour instead took a fifth more for a whole patch."""
     height, width = seen.shape

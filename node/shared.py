@@ -207,8 +207,7 @@ def _encode(scan: Scan, view: FirstView, range_part: str, texture_part: str) -> 
 def _parameters(
     spacing: int, x: int, y: int, wide: int, high: int, rho_x: int, rho_y: int, *, listed: tuple[int, ...] | None
 ) -> Parameters:
-    half_spacing, strides = from_spacing_byte(spacing)
-    return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, listed, strides)
+    return from_spacing_byte(spacing, Parameters(0, x, y, wide, high, rho_x, rho_y, listed))
 
 
 def _numbers(text: str, count: int) -> tuple[list[int], list[int], tuple[int, ...] | None]:

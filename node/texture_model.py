@@ -9,14 +9,18 @@ update that is sent. Of a sphere the rows' own texels are coded, zone by zone of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from node.polar import SPACINGS as POLAR_SPACINGS
+from node.polar import PolarTexture
 from protocol.codec import (
     JPEG_QUALITY_MAX,
     JPEG_QUALITY_MIN,
@@ -46,6 +50,8 @@ LOG_MSE_SLOPE = 0.08  # of a step of quality, on typical skin
 LOG_BYTES_SLOPE = 0.07
 BIAS_WEIGHT = 0.3
 WEIGHT_MIN = 0.1  # of a cell that keeps no detail, in doublings of error
+COMPARED_EVERY = 4  # of a map's texels, along and across
+DISC_SHARE = math.pi / 4  # of a map, on which the texture's blocks lie
 STRETCHED = 4  # steps of quality by which the quantiser acts finer on texels twice as dense along one axis
 
 
@@ -122,7 +128,8 @@ class _Measured:
         self.mse = np.empty((len(self.qualities), *cells), np.float32)
         self.content = np.empty((len(self.qualities), *cells), np.float32)
         self.constant = np.zeros(len(self.qualities))
-        self.bias = 1.0
+        self.bias = 1.0  # of bytes, and of errors
+        self.worse = 1.0
 
 
 class Place:
@@ -134,18 +141,18 @@ class Place:
         content: NDArray[np.float32],
         mse: NDArray[np.float32],
         stride: IntArray,
-        sent: IntArray,
+        sent: IntArray | None,
     ) -> None:
         self._measured, self._content, self._mse, self._area = measured, content, mse, 1.0 / stride
-        self._denser = STRETCHED * np.log2(stride / sent)
-        self._images = 1 + np.count_nonzero(np.diff(sent))
+        self._denser = np.zeros(stride.size) if sent is None else STRETCHED * np.log2(stride / sent)
+        self._images = 1 if sent is None else 1 + np.count_nonzero(np.diff(sent))
         self._is_even = bool((stride == 1).all())
 
     def expect(self, among: BoolArray) -> Expected:
         """What some blocks, (rows, columns) of Region.blocks, will take and reach."""
         content, mse = self._sums(among)
         area = float(self._area @ among.sum(axis=1))
-        log_mse = np.log(np.maximum(mse / area, MSE_MIN)) if area else 0 * mse
+        log_mse = np.log(np.maximum(self._measured.worse * mse / area, MSE_MIN)) if area else 0 * mse
         size_bytes = (content + self._images * self._measured.constant) * self._measured.bias
         return Expected(self._measured.qualities, log_mse, np.log(np.maximum(size_bytes, 1.0)))
 
@@ -167,7 +174,7 @@ class TextureModel:
 
     texture : (Ht, Wt, 3) uint8 RGB; coded whole, once, in the calling thread.
     first_view : the same as a client sees it that has nothing else; None: as bad as can be.
-    sphere : rows are polar angles, and hold fewer texels of their own near the poles.
+    sphere : rows are polar angles, and hold fewer texels of their own near the poles.   maps : then, round these.
     unwanted : asked between tiles; when true, the work is dropped and CancelledError raised.
     """
 
@@ -186,10 +193,15 @@ class TextureModel:
             self._first_mse[:] = _cell_errors(texture, first_view)
         self._stride = ring_strides(width, height, CELL) if sphere else np.ones(self._cells[0], np.int64)
         self._measured = {
-            (codec, p): _Measured(codec, p, self._cells) for codec in QUALITIES for p in SPACINGS
+            (codec, p, False): _Measured(codec, p, self._cells) for codec in QUALITIES for p in SPACINGS
         }
         for measured in self._measured.values():
             _survey_zones(measured, texture, self._stride, unwanted)
+        self.maps = PolarTexture(texture) if sphere else None
+        if self.maps is not None:
+            for codec, p in product(QUALITIES, POLAR_SPACINGS):
+                of_strips = self._measured[codec, p, False]
+                self._measured[codec, p, True] = _survey_maps(of_strips, texture, self.maps, unwanted)
 
     def expect(
         self,
@@ -197,39 +209,52 @@ class TextureModel:
         codec: TextureCodec,
         p: int = 1,
         among: BoolArray | None = None,
-        strides: tuple[int, ...] = STRIDES,
+        strides: tuple[int, ...] | None = STRIDES,
     ) -> Expected:
         """What the blocks that a region touches will take and reach at a spacing, or those among them.
 
         p : one of SPACINGS.   among : (rows, columns) of Region.blocks, bool; None: all that it touches.
-        strides : of the strips that they travel in.
+        strides : of the strips that they travel in; None: as one image of a pole.
         """
         return self.place(region, codec, p, strides).expect(region.touched(CELL) if among is None else among)
 
-    def place(self, region: Region, codec: TextureCodec, p: int = 1, strides: tuple[int, ...] = STRIDES) -> Place:
+    def place(
+        self, region: Region, codec: TextureCodec, p: int = 1, strides: tuple[int, ...] | None = STRIDES
+    ) -> Place:
         """The same region again and again, each time with other blocks of it; arguments as of `expect`."""
-        measured = self._measured[codec, p]
+        measured = self._measured[codec, p, strides is None]
         left, top, wide, high = region.blocks(CELL)
         rows, columns = slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
         content, mse = (values[:, rows].take(columns, axis=2) for values in (measured.content, measured.mse))
-        return Place(measured, content, mse, self._stride[rows], limited_strides(self._stride[rows], strides))
+        stride = self._stride[rows]
+        return Place(measured, content, mse, stride, None if strides is None else limited_strides(stride, strides))
 
     def mse_at(self, rows: IntArray, columns: IntArray, quality: IntArray) -> FloatArray:
         """Squared error per value of single blocks at qualities of their own; -1 is the first view. (n,) each"""
         if (quality < 0).all():  # nearly always: nobody looked there before
             return self._first_mse[rows, columns].astype(np.float64)
-        measured = self._measured[TextureCodec.HTJ2K, 1]
+        measured = self._measured[TextureCodec.HTJ2K, 1, False]
         scale = np.array(measured.qualities, np.float64)
         above = np.clip(np.searchsorted(scale, quality), 1, scale.size - 1)
         part = np.clip((quality - scale[above - 1]) / (scale[above] - scale[above - 1]), 0, 1)
         low, high = (np.log(np.maximum(measured.mse[index, rows, columns], MSE_MIN)) for index in (above - 1, above))
         return np.where(quality < 0, self._first_mse[rows, columns], np.exp(low + part * (high - low)))
 
-    def learn(self, codec: TextureCodec, p: int, expected_bytes: float, actual_bytes: int) -> None:
-        """Take note of what a patch really took."""
+    def learn(
+        self,
+        codec: TextureCodec,
+        p: int,
+        expected_bytes: float,
+        actual_bytes: int,
+        *,
+        polar: bool = False,
+        worse: float = 1.0,
+    ) -> None:
+        """Take note of what a patch, or an image of a pole, really took, and how much `worse` it was."""
         if expected_bytes > 0 and actual_bytes > 0:
-            ratio = min(max(actual_bytes / expected_bytes, 0.5), 2.0)
-            self._measured[codec, p].bias *= ratio**BIAS_WEIGHT  # two threads at once: one of them is not learned from
+            measured = self._measured[codec, p, polar]  # two threads at once: one of them is not learned from
+            measured.bias *= min(max(actual_bytes / expected_bytes, 0.5), 2.0) ** BIAS_WEIGHT
+            measured.worse *= min(max(worse, 0.5), 2.0) ** BIAS_WEIGHT
 
 
 def _shifted(qualities: tuple[int, ...], values: FloatArray, by: FloatArray) -> FloatArray:
@@ -257,6 +282,31 @@ def _survey_zones(
         measured.content[:, first:last] = zone.content.repeat(t, axis=2)[:, :, :columns] / t
         if own.size > largest:
             largest, measured.constant = own.size, zone.constant
+
+
+def _survey_maps(
+    of_strips: _Measured, texture: ImageArray, maps: PolarTexture, unwanted: Callable[[], bool]
+) -> _Measured:
+    """What images of the poles take and miss: their maps are coded whole, and some texels held against them.
+
+    What a map takes is spread over its blocks as what their strips take.
+    """
+    codec, p = of_strips.codec, of_strips.p
+    measured = _Measured(codec, p, of_strips.mse.shape[1:])
+    measured.mse[:], measured.content[:], measured.constant[:] = of_strips.mse, of_strips.content, of_strips.constant
+    columns = np.arange(COMPARED_EVERY // 2, texture.shape[1], COMPARED_EVERY)
+    for place, image, on_it in maps.halves(p):
+        rows = np.arange(on_it.start * CELL + COMPARED_EVERY // 2, on_it.stop * CELL, COMPARED_EVERY)
+        truth = np.ascontiguousarray(texture[rows][:, columns])
+        for index, quality in enumerate(measured.qualities):
+            if unwanted():
+                raise CancelledError
+            payload = encode_texture(image, codec, quality)
+            seen = place.texels_at(rows, columns, decode_texture(payload, codec, quality, place.sample_shape))
+            measured.mse[index, on_it] = _cell_errors(truth, seen, CELL // COMPARED_EVERY)
+            content = measured.content[index, on_it]
+            content *= max(DISC_SHARE * (len(payload) - measured.constant[index]), 1.0) / float(content.sum())
+    return measured
 
 
 def _survey(measured: _Measured, texture: ImageArray, unwanted: Callable[[], bool]) -> None:

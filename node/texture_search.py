@@ -15,9 +15,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from node.coded import Coded, fewest_strips, framed, message_overhead
+from node.coded import Coded, fewest_strips, framed, message_overhead, region_lattice
 from node.held_texture import HELD_MARGIN, HeldTexture
 from node.library import Scan
+from node.polar import SPACINGS as POLAR_SPACINGS
+from node.polar import PolarTexture, reaches
 from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
     CODECS,
@@ -96,9 +98,21 @@ class TextureSearch:
         self.limited = False
         self.mse: float | None = None
 
+    def _is_polar(self, p: int) -> bool:
+        """Whether texture at a spacing travels as one image of a pole: where strips of several strides would meet."""
+        return p in POLAR_SPACINGS and self._maps is not None
+
+    @cached_property
+    def _maps(self) -> PolarTexture | None:
+        """The maps of the poles, where they are there and of use."""
+        shape = self._state.shapes[Channel.TEXTURE]
+        if self._model is None or not reaches(shape, self._region):
+            return None
+        return self._model.maps
+
     @cached_property
     def _strides(self) -> tuple[int, ...]:
-        """Of the strips that texture travels in."""
+        """Of the strips that texture travels in elsewhere."""
         return fewest_strips(self._state.shapes[Channel.TEXTURE], self._region)
 
     @cached_property
@@ -191,7 +205,9 @@ class TextureSearch:
     def _place(self, p: int) -> Place:
         assert self._model is not None  # else nobody asks
         if p not in self._places:
-            self._places[p] = self._model.place(self._region, CODECS[self._codec], p, self._strides)
+            self._places[p] = self._model.place(
+                self._region, CODECS[self._codec], p, None if self._is_polar(p) else self._strides
+            )
         return self._places[p]
 
     def _blocks(self, listed: tuple[int, ...]) -> BoolArray:
@@ -272,6 +288,7 @@ class TextureSearch:
             if search.fits(coded):
                 coded = self._measured(p, coded)
                 mse = self._error(coded)
+                self._learn(p, coded, mse)
                 search.measured(Point(quality, mse, coded))
                 if mse > self._target_mse and self._spoilt(coded):
                     search.at_least(self._mending_quality(p, coded))
@@ -294,18 +311,19 @@ class TextureSearch:
             return _of_strips(earlier, strips)
         self._encodes.add()
         if (p, carried) not in self._images:
-            self._images[p, carried] = texture_images(self._scan, strips, codec)
+            self._images[p, carried] = texture_images(self._scan, strips, codec, self._maps)
         return code_texture_strips(strips, self._images[p, carried], quality, codec, quick=self._quick)
 
     def _lattice(self, p: int) -> Parameters:
         """Of the whole window at a spacing."""
+        if self._is_polar(p):
+            return replace(region_lattice(self._region, Channel.TEXTURE, 2 * p), polar=True)
         return texture_lattice(self._state, self._region, TextureParameters(p, s=self.skirt(p)))
 
     def _measured(self, p: int, coded: Coded) -> Coded:
         """A try with what a client makes of it, and noted, so that it is not made again."""
         coded = measured(coded)
         self._tried[p, coded.quality, _carried(coded.strips)] = coded
-        self._learn(p, coded)
         return coded
 
     def _spoilt(self, coded: Coded) -> bool:
@@ -340,12 +358,20 @@ class TextureSearch:
         """Which of the window's blocks a refinement changes."""
         return self._held.touched & ~self._held.left_alone(coded)
 
-    def _learn(self, p: int, coded: Coded) -> None:
-        """Tell the model what a refinement took, where a skirt is not what took it."""
-        if self._model is not None and self._look.alpha is None:
-            expected = self._place(p).expect(self._sent(coded))
-            self._model.learn(CODECS[self._codec], p, expected.size_bytes(coded.quality), len(coded.payload))
-            self._known.clear()
+    def _learn(self, p: int, coded: Coded, mse: float | None = None) -> None:
+        """Tell the model what a refinement took, where a skirt is not what took it.   mse : what the window then has.
+
+        What images of a pole miss it learns, too: their maps were measured whole, not by tiles.
+        """
+        if self._model is None or self._look.alpha is not None:
+            return
+        sent, polar = self._sent(coded), self._is_polar(p)
+        expected, worse = self._place(p).expect(sent), 1.0
+        if polar and mse is not None and bool((sent == self._held.touched).all()):
+            worse = mse / expected.mse(coded.quality)
+        taken = expected.size_bytes(coded.quality), len(coded.payload)
+        self._model.learn(CODECS[self._codec], p, *taken, polar=polar, worse=worse)
+        self._known.clear()
 
 
 def _of_strips(coded: Coded, strips: Strips) -> Coded:

@@ -25,6 +25,7 @@ NO_SKIRT = 0
 STRIDES = (1, 2, 4, 8, 16)
 # Those that a refinement may allow its strips, as they are numbered on the wire: all, or few for fewer strips.
 STRIDE_SETS = (STRIDES, (1,), (1, 2), (1, 2, 4), (1, 2, 4, 8), (1, 2, 8), (1, 4, 16))
+POLAR_HALF_SPACING_MIN = 4  # finer is exact, or would claim to be
 LEVEL_MAX = 40
 _LEVEL_BOUNDS = (QUARTERS * QUARTERS) * (1 << np.arange(LEVEL_MAX, dtype=np.int64))
 
@@ -120,6 +121,7 @@ class Parameters:
     listed : None, or run lengths over the plateau's blocks in row order, unlisted first: only listed ones are adopted.
     strides : on a sphere, how many columns apart the samples of a strip may stand, one of STRIDE_SETS: the fewer of
     these, the fewer and wider strips (protocol.strips). STRIDES everywhere else.
+    polar : texture round a pole of a sphere travels as one image of it (protocol.polar).
     """
 
     half_spacing: int
@@ -131,6 +133,7 @@ class Parameters:
     rho_y: int = NO_SKIRT
     listed: tuple[int, ...] | None = None
     strides: tuple[int, ...] = STRIDES
+    polar: bool = False
 
     @property
     def spacing(self) -> float:
@@ -238,8 +241,17 @@ def check_parameters(shape: ChannelShape, p: Parameters) -> None:
         raise LatticeError(f"spacing {p.spacing} does not divide the {shape.width} columns")
     if p.strides not in (STRIDE_SETS if shape.sphere else (STRIDES,)):
         raise LatticeError(f"strips with strides of {p.strides} do not fit the scan")
+    if p.polar and not _fits_polar(shape, p):
+        raise LatticeError("an image of a pole is texture of one hemisphere, at spacing 2 or more and without a skirt")
     if p.blocks_wide == columns and (p.block_x or 2 * shape.width % p.half_spacing):
         raise LatticeError("a plateau all round must start at block 0 and its spacing divide the width")
+
+
+def _fits_polar(shape: ChannelShape, p: Parameters) -> bool:
+    top, bottom = 2 * p.block_y * shape.block, 2 * (p.block_y + p.blocks_high) * shape.block
+    one_hemisphere = bottom <= shape.height or top >= shape.height
+    plain = p.rho_x == p.rho_y == NO_SKIRT and p.strides == STRIDES and p.half_spacing >= POLAR_HALF_SPACING_MIN
+    return shape.sphere and shape.channel is Channel.TEXTURE and one_hemisphere and plain
 
 
 def axis_x(shape: ChannelShape, p: Parameters) -> Axis:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import lru_cache
 
@@ -28,6 +28,7 @@ PAYLOAD_MAX = 256 << 20
 HALF = 15  # of a byte, at most
 HALVES_MAX = 8  # of a step, behind the first
 SPACING_BITS = 5  # of the byte that half spacing and the largest stride share
+POLAR = 7  # in its other bits, where others number STRIDE_SETS
 AnyParameters = Parameters | ClassicParameters | SphereParameters
 
 
@@ -134,23 +135,25 @@ def unpack_parameters(data: bytes) -> Parameters:
         raise RemoteWireError("lattice parameters are cut short")
     runs = _unpack_runs(data[PARAMETERS.size :])
     spacing, x, y, wide, high, rho_x, rho_y = PARAMETERS.unpack_from(data)
-    half_spacing, strides = from_spacing_byte(spacing)
-    return Parameters(half_spacing, x, y, wide, high, rho_x, rho_y, runs or None, strides)
+    return from_spacing_byte(spacing, Parameters(0, x, y, wide, high, rho_x, rho_y, runs or None))
 
 
 def spacing_byte(p: Parameters) -> int:
-    """Half spacing, and in the upper three bits which of STRIDE_SETS strips may have."""
+    """Half spacing, and in the upper three bits which of STRIDE_SETS strips may have, or that there is one image."""
     if p.half_spacing >> SPACING_BITS:
         raise LocalWireError(f"a spacing of {p.spacing} does not travel")
     if p.strides not in STRIDE_SETS:
         raise LocalWireError(f"strides of {p.strides} do not travel")
-    return p.half_spacing | STRIDE_SETS.index(p.strides) << SPACING_BITS
+    return p.half_spacing | (POLAR if p.polar else STRIDE_SETS.index(p.strides)) << SPACING_BITS
 
 
-def from_spacing_byte(spacing: int) -> tuple[int, tuple[int, ...]]:
-    """Inverse of spacing_byte: half spacing and strides; none where their number means nothing."""
+def from_spacing_byte(spacing: int, others: Parameters) -> Parameters:
+    """Inverse of spacing_byte: others with what it says; without strides where their number means nothing."""
     half_spacing, number = spacing % (1 << SPACING_BITS), spacing >> SPACING_BITS
-    return half_spacing, STRIDE_SETS[number] if number < len(STRIDE_SETS) else ()
+    if number == POLAR:
+        return replace(others, half_spacing=half_spacing, polar=True)
+    strides = STRIDE_SETS[number] if number < len(STRIDE_SETS) else ()
+    return replace(others, half_spacing=half_spacing, strides=strides)
 
 
 def _read_header(data: bytes) -> tuple[Generator, Channel, int, int, int, int, int, int, int, tuple[int, int, int]]:

@@ -2,7 +2,8 @@
 
 Where rows of blocks have one stride (protocol.rings), they are a cylinder of own samples, W / stride columns round.
 So every strip is a lattice as any other, round the blocks that are listed in it; a cylinder has a single one. Payloads
-and masks of several strips stand one behind the other, each behind its length (u32, little-endian).
+and masks of several strips stand one behind the other, each behind its length (u32, little-endian). Texture round a
+pole may travel as one image instead (protocol.polar), from which each strip takes what is its own.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from protocol.codec import TextureCodec
 from protocol.errors import CodecError
-from protocol.grid import BoolArray, IntArray
+from protocol.grid import BoolArray, ImageArray, IntArray
 from protocol.holdings import ChannelHoldings
 from protocol.lattice import (
     Axis,
@@ -31,7 +32,8 @@ from protocol.lattice import (
     listed_blocks,
     runs_to_mask,
 )
-from protocol.reconstruct import Selection, select
+from protocol.polar import PolarImage, polar_image
+from protocol.reconstruct import Selection, select, texture_patch
 from protocol.rings import limited_strides, ring_strides
 
 LENGTH = struct.Struct("<I")
@@ -39,10 +41,14 @@ LENGTH = struct.Struct("<I")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strip:
-    """What one strip carries.  adopted : (by, bx) bool over its lattice's covered blocks."""
+    """What one strip carries.
+
+    adopted : (by, bx) bool over its lattice's covered blocks.   polar : the image that all strips travel in, if so.
+    """
 
     selection: Selection
     adopted: BoolArray
+    polar: PolarImage | None = None
 
 
 Strips = tuple[Strip, ...]
@@ -74,18 +80,38 @@ def build_strips(shape: ChannelShape, parameters: Parameters) -> tuple[Lattice, 
 
 def select_strips(lattices: Sequence[Lattice], held: ChannelHoldings, rank: int) -> Strips:
     """What a refinement at `rank` would carry to a client that holds `held`; nothing when nothing would be adopted."""
-    found = ((lattice, select(lattice, held, rank)) for lattice in lattices)
-    return tuple(Strip(*chosen) for _, chosen in found if chosen is not None)
+    found = [chosen for chosen in (select(lattice, held, rank) for lattice in lattices) if chosen is not None]
+    polar = None
+    if found and found[0][0].lattice.parameters.polar:
+        polar = polar_image([selection for selection, _ in found])
+    return tuple(Strip(*chosen, polar) for chosen in found)
 
 
 def samples_of(strips: Strips) -> int:
     """Values in a payload."""
+    if strips and strips[0].polar is not None:
+        return strips[0].polar.samples
     return sum(strip.selection.samples for strip in strips)
 
 
 def blocks_of(strips: Strips) -> IntArray:
     """Flat indices of the adopted blocks, strip after strip. (n,) int64"""
     return np.concatenate([np.zeros(0, np.int64), *(strip.selection.adopted_blocks() for strip in strips)])
+
+
+def image_shapes(strips: Strips, codec: TextureCodec) -> list[tuple[int, int]]:
+    """Rows and columns of each image of a payload of texture."""
+    if strips[0].polar is not None:
+        return [strips[0].polar.sample_shape]
+    return [image_shape(strip.selection, codec) for strip in strips]
+
+
+def texture_patches(strips: Strips, images: Sequence[ImageArray]) -> list[ImageArray]:
+    """Dense texture of each strip's rectangle from the images of a payload. (rows, columns, 3) uint8 each"""
+    if (polar := strips[0].polar) is not None:
+        return [polar.patch(strip.selection, images[0]) for strip in strips]
+    selections = [strip.selection for strip in strips]
+    return [texture_patch(one, image[: one.sample_shape[0]]) for one, image in zip(selections, images, strict=True)]
 
 
 def image_shape(selection: Selection, codec: TextureCodec) -> tuple[int, int]:
