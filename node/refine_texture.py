@@ -35,6 +35,7 @@ from protocol.strips import (
 )
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
+NARROW_ROWS, NARROW_TO = 4, 3 * TEXTURE_BLOCK  # rows from a pole whose texels' width changes within a block
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -198,9 +199,12 @@ def _bands(selection: Selection) -> Iterator[tuple[slice, float]]:
     if not shape.sphere:
         yield slice(0, rows), 1.0
         return
-    for top in range(0, rows, TEXTURE_BLOCK):
-        bottom = min(top + TEXTURE_BLOCK, rows)
+    top = 0
+    while top < rows:
+        from_pole = min(first + top, shape.height - TEXTURE_BLOCK - first - top)
+        bottom = min(top + (NARROW_ROWS if from_pole < NARROW_TO else TEXTURE_BLOCK), rows)
         yield slice(top, bottom), shape.stride * math.sin(math.pi * (first + (top + bottom) / 2) / shape.height)
+        top = bottom
 
 
 def mse_of_db(db: float) -> float:

@@ -5,8 +5,8 @@
 strips.json: `strides` by width, height, side of a block and half spacing. `range`: refinements over holdings, one after
 the other, as hex of the whole message, with the strips they carry and what they leave: dense range as in
 write_protocol.py (a scan by that rule, void where mix32(row W + column) mod 16 is 0, its rings thinned), holdings and
-digest. `texture`: texel value i = mix32(i) mod 256, i counting bytes through all strips; the dense result, 0 where
-nothing is adopted, may differ by the stated tolerance.
+digest. `texture`: texel value i = mix32(i) mod 256, i counting bytes through all images; `polar`: left, top, columns
+and rows of that of a pole; the dense result, 0 where nothing is adopted, may differ by the stated tolerance.
 
 lattices.json, of the classic profile: angles are radians. rings: grid [W, H], fovea [theta_v, theta_h], plateau [cap,
 spacing, rho, coarse]; bearings by ring; row and column of the snapped directions. literal: down and across are [count,
@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol import codec_lift
-from protocol.codec import RangeCodec, encode_mask
+from protocol.codec import RangeCodec, TextureCodec, encode_mask
 from protocol.grid import VOID
 from protocol.holdings import Holdings, mix32, range_rank, texture_rank
 from protocol.lattice import STRIDE_SETS, Channel, ChannelShape, Parameters
-from protocol.reconstruct import Selection, content_hashes, cut, paste, range_patch, texture_patch
-from protocol.refinement import Generator, Refinement
+from protocol.reconstruct import Selection, content_hashes, cut, paste, range_patch
+from protocol.refinement import POLAR, Generator, Refinement
 from protocol.rings import ring_strides, thin_rings
 from protocol.sphere import (
     DirectionGrid,
@@ -40,7 +40,15 @@ from protocol.sphere import (
     ring_lattice,
     rotated_lattice,
 )
-from protocol.strips import blocks_of, build_strips, join_parts, samples_of, select_strips
+from protocol.strips import (
+    blocks_of,
+    build_strips,
+    image_shapes,
+    join_parts,
+    samples_of,
+    select_strips,
+    texture_patches,
+)
 
 FOLDER = Path(__file__).with_name("sphere")
 RHO_E = 178145  # round(65536 e), S' = 1
@@ -79,6 +87,8 @@ TEXTURES = [
     (Parameters(4, 0, 0, 4, 9, strides=(1, 2)), 60),
     (Parameters(2, 0, 0, 4, 9, strides=(1, 2, 8)), 60),
     (Parameters(4, 0, 0, 4, 9, strides=(1, 4, 16)), 60),
+    (Parameters(4, 0, 0, 4, 3, polar=True), 60),
+    (Parameters(8, 3, 5, 2, 4, listed=(0, 3, 1, 1, 1, 2), polar=True), 60),
 ]
 
 
@@ -152,15 +162,19 @@ def _texture(files: dict[str, bytes], number: int, parameters: Parameters, quali
     strips = select_strips(build_strips(TEXTURE, parameters), held, texture_rank(quality))
     values = (mix32(np.arange(3 * samples_of(strips), dtype=np.uint32)) % np.uint32(256)).astype(np.uint8)
     dense, done = np.zeros((TEXTURE.height, TEXTURE.width, 3), np.uint8), 0
-    for selection in (strip.selection for strip in strips):
-        texels = values[done : done + 3 * selection.samples].reshape(*selection.sample_shape, 3)
-        paste(dense, texture_patch(selection, texels), selection)
-        done += 3 * selection.samples
+    images = []
+    for shape in image_shapes(strips, TextureCodec.JPEG):
+        size = 3 * math.prod(shape)
+        images.append(values[done : done + size].reshape(*shape, 3))
+        done += size
+    for strip, patch in zip(strips, texture_patches(strips, images), strict=True):
+        paste(dense, patch, strip.selection)
     files[f"texture_{number}.bin"] = dense.tobytes()
     return {
         "parameters": _parameters(parameters),
         "quality": quality,
         "strips": [_strip(strip.selection) for strip in strips],
+        "polar": (polar := strips[0].polar) and [polar.left, polar.top, polar.columns, polar.rows],
         "tolerance": 2,
         "dense": f"texture_{number}.bin",
     }
@@ -200,7 +214,8 @@ def _parameters(p: Parameters) -> dict[str, Any]:
     return {
         "halfSpacing": p.half_spacing, "blockX": p.block_x, "blockY": p.block_y, "blocksWide": p.blocks_wide,
         "blocksHigh": p.blocks_high, "rhoX": p.rho_x, "rhoY": p.rho_y,
-        "listed": None if p.listed is None else list(p.listed), "strides": STRIDE_SETS.index(p.strides),
+        "listed": None if p.listed is None else list(p.listed),
+        "strides": POLAR if p.polar else STRIDE_SETS.index(p.strides),
     }  # fmt: skip
 
 

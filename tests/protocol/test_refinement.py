@@ -26,7 +26,7 @@ U16, U32 = st.integers(0, 0xFFFF), st.integers(0, 0xFFFFFFFF)
 RUNS = st.none() | st.lists(st.integers(0, 2**22), min_size=1, max_size=20).map(tuple)
 PARAMETERS = st.builds(
     Parameters, st.integers(0, 31), U16, U16, U16, U16, U32, U32, RUNS, st.sampled_from(STRIDE_SETS)
-)
+) | st.builds(Parameters, st.integers(0, 31), U16, U16, U16, U16, U32, U32, RUNS, polar=st.just(True))
 REFINEMENTS = st.builds(
     Refinement,
     generator=st.just(Generator.FOVEA),

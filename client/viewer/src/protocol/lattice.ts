@@ -11,6 +11,9 @@ export const CHANNELS: readonly Channel[] = [RANGE, TEXTURE];
 export const QUARTERS = 4;
 /** How many columns apart the samples of a strip may stand, by the number on the wire: STRIDE_SETS of protocol/lattice.py. */
 export const STRIDE_SETS = [[1, 2, 4, 8, 16], [1], [1, 2], [1, 2, 4], [1, 2, 4, 8], [1, 2, 8], [1, 4, 16]];
+/** Their number where all strips travel as one image of a pole (polar.ts). */
+export const POLAR = 7;
+const POLAR_HALF_SPACING_MIN = 4;
 const RHO_ONE = 1 << 16;
 const RHO_MAX = 1 << 20;
 const HALF_SPACINGS: Record<Channel, readonly number[]> = { [RANGE]: [2, 4, 8, 16], [TEXTURE]: [2, 3, 4, 6, 8, 12, 16] };
@@ -122,6 +125,15 @@ export function latticeOf(shape: ChannelShape, p: Parameters, x: Axis, y: Axis):
   return { shape, x, y, level, listed: listedBlocks(shape, p, x, y) };
 }
 
+/** Whether strips travel as one image of a pole. */
+export const isPolar = (p: Parameters): boolean => p.strides === POLAR;
+
+function fitsPolar(shape: ChannelShape, p: Parameters): boolean {
+  const [top, bottom] = [2 * p.blockY * blockSide(shape), 2 * (p.blockY + p.blocksHigh) * blockSide(shape)];
+  const isPlain = p.rhoX === 0 && p.rhoY === 0 && p.halfSpacing >= POLAR_HALF_SPACING_MIN;
+  return !!shape.sphere && shape.channel === TEXTURE && isPlain && (bottom <= shape.height || top >= shape.height);
+}
+
 /** Throws RemoteWireError unless the parameters describe a lattice. */
 export function checkParameters(shape: ChannelShape, p: Parameters): void {
   const [rows, columns] = [blocksDown(shape), blocksAcross(shape)];
@@ -132,7 +144,7 @@ export function checkParameters(shape: ChannelShape, p: Parameters): void {
     p.blockX >= 0 && p.blockX < columns && p.blocksWide >= 1 && p.blocksWide <= columns &&
     p.blockY >= 0 && p.blocksHigh >= 1 && p.blockY + p.blocksHigh <= rows &&
     rhoFits(p.rhoX) && rhoFits(p.rhoY) &&
-    (p.strides ?? 0) < (shape.sphere ? STRIDE_SETS.length : 1) &&
+    (isPolar(p) ? fitsPolar(shape, p) : (p.strides ?? 0) < (shape.sphere ? STRIDE_SETS.length : 1)) &&
     (shape.channel === TEXTURE || divides) &&
     (p.blocksWide < columns || (p.blockX === 0 && divides));
   if (!fits) throw new RemoteWireError(`no lattice: ${JSON.stringify(p)}`);

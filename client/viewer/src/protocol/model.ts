@@ -8,13 +8,15 @@ import { RANGE, TEXTURE } from './lattice.ts';
 import type { Channel, ChannelShape } from './lattice.ts';
 import { channelShapes } from './messages.ts';
 import type { FromClient, ScanInfo, Statement } from './messages.ts';
+import { polarPatch } from './polar.ts';
+import type { PolarImage } from './polar.ts';
 import {
   coarseToRange, contentHashes, denseOf, onlyFiner, paste, rangePatch, spans, texturePatch,
 } from './reconstruct.ts';
 import type { Chosen, Selection, Span } from './reconstruct.ts';
 import { COARSE } from './refinement.ts';
 import type { Refinement } from './refinement.ts';
-import { buildStrips, imageRows, samplesOf, selectStrips, splitParts } from './strips.ts';
+import { buildStrips, imageOfPole, imageRows, samplesOf, selectStrips, splitParts } from './strips.ts';
 
 const STATEMENTS_MAX = 3;
 
@@ -133,22 +135,23 @@ export class Model {
     if (!this.complete) throw new RemoteWireError('a fovea before the first view');
     const { channel, quality } = refinement;
     const rank = rankOf(channel, quality);
-    const strips = this.selected(refinement, rank);
+    const { strips, pole } = this.selected(refinement, rank);
     const changed = channel === RANGE
       ? this.pasteRange(strips, await rangePatches(refinement, strips, codecs))
-      : this.pasteTexture(strips, await texturePatches(refinement, strips, codecs));
+      : this.pasteTexture(strips, await texturePatches(refinement, strips, pole, codecs));
     for (const { selection, adopted } of strips) this.holdings.channels[channel].adopt(selection.lattice, adopted, rank);
     return changed;
   }
 
-  private selected(refinement: Refinement, rank: number): Chosen[] {
+  private selected(refinement: Refinement, rank: number): { strips: Chosen[]; pole: PolarImage | null } {
     const { channel, parameters, samples, selfContained } = refinement;
     const held = this.holdings.channels[channel];
     const plannedOver = selfContained ? new ChannelHoldings(this.shapes[channel]) : held;
     const strips = selectStrips(buildStrips(this.shapes[channel], parameters!), plannedOver, rank);
-    const expected = samplesOf(strips);
+    const pole = imageOfPole(this.shapes[channel], parameters!, strips);
+    const expected = samplesOf(strips, pole);
     if (!strips.length || expected !== samples) throw new HoldingsDiffer(`${samples} samples, ${expected} expected`);
-    return selfContained ? strips.map((strip) => onlyFiner(strip, held, rank)) : strips;
+    return { strips: selfContained ? strips.map((strip) => onlyFiner(strip, held, rank)) : strips, pole };
   }
 
   private pasteRange(strips: Chosen[], patches: Uint16Array[]): Changed[] {
@@ -201,8 +204,14 @@ async function rangePatches({ payload, mask, codec, quality }: Refinement, strip
 }
 
 /** The same of texture. */
-async function texturePatches({ payload, mask, codec, quality }: Refinement, strips: Chosen[], codecs: Codecs): Promise<Uint8Array[]> {
+async function texturePatches(
+  { payload, mask, codec, quality }: Refinement, strips: Chosen[], pole: PolarImage | null, codecs: Codecs,
+): Promise<Uint8Array[]> {
   if (mask.length) throw new RemoteWireError('texture has no voids of its own');
+  if (pole) {
+    const texels = await codecs.texture(payload, codec, pole.rows, pole.columns, quality);
+    return strips.map(({ selection }) => polarPatch(pole, selection, texels));
+  }
   const payloads = splitParts(payload, strips.length);
   return Promise.all(strips.map(async ({ selection }, index) => {
     const { x, y } = selection;

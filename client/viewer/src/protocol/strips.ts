@@ -5,9 +5,11 @@ import { HTJ2K } from './codec.ts';
 import { RemoteWireError } from './errors.ts';
 import type { ChannelHoldings } from './holdings.ts';
 import {
-  STRIDE_SETS, axisX, axisY, blockSide, blocksAcross, buildLattice, checkParameters, latticeOf, runsToMask,
+  STRIDE_SETS, axisX, axisY, blockSide, blocksAcross, buildLattice, checkParameters, isPolar, latticeOf, runsToMask,
 } from './lattice.ts';
 import type { Axis, ChannelShape, Lattice, Parameters } from './lattice.ts';
+import { polarImage } from './polar.ts';
+import type { PolarImage } from './polar.ts';
 import { select, selectionSamples } from './reconstruct.ts';
 import type { Chosen, Selection } from './reconstruct.ts';
 import { ringStrides } from './rings.ts';
@@ -20,7 +22,7 @@ export function buildStrips(shape: ChannelShape, p: Parameters): Lattice[] {
   checkParameters(shape, p);
   const y = axisY(shape, p);
   const [owns, strides] = [2, p.halfSpacing].map((half) => ringStrides(shape.width, shape.height, blockSide(shape), half));
-  const allowed = STRIDE_SETS[p.strides ?? 0]!;
+  const allowed = STRIDE_SETS[isPolar(p) ? 0 : (p.strides ?? 0)]!;
   const strideOf = (block: number) => allowed.filter((stride) => stride <= strides![block]!).at(-1)!;
   const strips: Lattice[] = [];
   for (let begin = 0, end = 0; begin < y.block.length; begin = end) {
@@ -38,8 +40,15 @@ export function selectStrips(lattices: Lattice[], held: ChannelHoldings, rank: n
   return lattices.flatMap((lattice) => select(lattice, held, rank) ?? []);
 }
 
+/** The image that all strips travel in, of texture round a pole; null where each has its own. */
+export function imageOfPole(shape: ChannelShape, p: Parameters, strips: Chosen[]): PolarImage | null {
+  return isPolar(p) && strips.length ? polarImage(shape, p, strips.map(({ selection }) => selection)) : null;
+}
+
 /** Values in a payload. */
-export const samplesOf = (strips: Chosen[]): number => strips.reduce((sum, { selection }) => sum + selectionSamples(selection), 0);
+export function samplesOf(strips: Chosen[], pole: PolarImage | null = null): number {
+  return pole ? pole.rows * pole.columns : strips.reduce((sum, { selection }) => sum + selectionSamples(selection), 0);
+}
 
 /** Rows of the image in which a selection's texels travel: on a sphere as HTJ2K an odd number, the last repeated. */
 export function imageRows({ lattice, y }: Selection, codec: number): number {
