@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -59,6 +60,14 @@ def no_node(timeout_s: float) -> Exception:
     from client.errors import NodeLost
 
     return NodeLost(f"no node answered within {timeout_s:g} s; start one with `foveascan serve` or use --node")
+
+
+def made(unix_s: float) -> str:
+    """When, for a list: by here and now's clock; a node's may have been anywhere."""
+    try:
+        return datetime.fromtimestamp(unix_s).isoformat(" ", "minutes")
+    except (OverflowError, ValueError, OSError):
+        return "at no known time"
 
 
 def number(text: str) -> float:

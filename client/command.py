@@ -1,4 +1,4 @@
-"""A headless client: `discover`, `join`, `calibrate`, `scan`, `scans`, `export`, `import`, `derive` and `look`."""
+"""Headless client: `discover`, `join`, `calibrate`, `scan`, `scans`, `sweeps`, `export`, `import`, `derive`, `look`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,15 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from client import calibrate_command, derive_command, exchange_command, join_command, scan_command, scans_command
+from client import (
+    calibrate_command,
+    derive_command,
+    exchange_command,
+    join_command,
+    scan_command,
+    scans_command,
+    sweeps_command,
+)
 from client.arguments import add_node, add_search, between, byte_count, chosen_node, no_node, number, share
 from protocol.printable import printable
 
@@ -21,7 +29,7 @@ CENTRE = (0.5, 0.5)
 
 
 def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Offer `discover`, `join`, `calibrate`, `scan`, `scans`, `export`, `import`, `derive` and `look`."""
+    """Offer `discover`, `join`, `calibrate`, `scan`, `scans`, `sweeps`, `export`, `import`, `derive` and `look`."""
     finder = subparsers.add_parser("discover", help="list the nodes on this network")
     add_search(finder)
     finder.add_argument("--name", help="stop at the node of this name or id")
@@ -31,6 +39,7 @@ def add_subcommands(subparsers: argparse._SubParsersAction[argparse.ArgumentPars
     calibrate_command.add_subcommands(subparsers)
     scan_command.add_subcommands(subparsers)
     scans_command.add_subcommands(subparsers)
+    sweeps_command.add_subcommands(subparsers)
     exchange_command.add_subcommands(subparsers)
     derive_command.add_subcommands(subparsers)
 

@@ -144,9 +144,8 @@ def _bar(args: argparse.Namespace, what: str) -> Iterator[Moved]:
 
 def _add_geometry(parser: argparse.ArgumentParser) -> None:
     geometry = parser.add_argument_group("geometry", "whether it is seen from an axis, or from a centre inside it")
-    geometry.add_argument(
-        "--geometry", choices=("cylinder", "sphere"), help="(a grid as it is; a mesh as a sphere if it is closed)"
-    )
+    text = "(a grid as it is; a mesh as a sphere if it is closed); sphere says why one cannot be made"
+    geometry.add_argument("--geometry", choices=("cylinder", "sphere"), help=text)
     add_closing(geometry, Path, "FILE")
 
 

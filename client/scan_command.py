@@ -13,7 +13,8 @@ from protocol.printable import printable
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from client.session import Session
+    from client.news import News
+    from client.session import InterruptedSweep, Session
     from protocol.quality import FoundAxis, ScanQuality
 
 POLL_S = 0.2
@@ -32,14 +33,19 @@ def run_scan(args: argparse.Namespace) -> int:
     """Sweep once; print the new scan's id and quality."""
     import asyncio
 
-    scan, quality = asyncio.run(_scan(args))
-    if args.json:
+    asyncio.run(_scan(args))
+    return 0
+
+
+async def say_scan(session: Session, scan: str, as_json: bool) -> None:
+    """Print the id of a scan that was swept, and what it is worth."""
+    quality = await session.quality(scan)
+    if as_json:
         print(json.dumps({"scan": scan, "quality": record_of(quality) if quality else None}), flush=True)
-        return 0
+        return
     print(f"scan {printable(scan)}", flush=True)
     for line in _in_words(quality) if quality else ():
         print(line, flush=True)
-    return 0
 
 
 def record_of(said: ScanQuality | FoundAxis) -> dict[str, object]:
@@ -58,16 +64,52 @@ def _in_words(quality: ScanQuality) -> Iterator[str]:
     yield from (printable(complaint) for complaint in quality.complaints)
 
 
-async def _scan(args: argparse.Namespace) -> tuple[str, ScanQuality | None]:
+async def _scan(args: argparse.Namespace) -> None:
     from client.session import connect
 
     async with connect(await chosen_node(args), token=args.token) as session:
-        scan = await sweep_once(session, silent=args.json)
-        return scan, await session.quality(scan)
+        await say_scan(session, await sweep_once(session, silent=args.json), args.json)
 
 
 async def sweep_once(session: Session, *, silent: bool) -> str:
     """Start a sweep when the scanner is ready, follow it, return the scan's id. Raises ScannerFault when it fails."""
+    from protocol.errors import ScannerFault
+
+    published = session.published()
+    await _ready(session)
+    before = await _interrupted(session)
+    number = (await session.start_sweep())["sweep"]
+    try:
+        return await _followed(session, published, number, silent)
+    except ScannerFault as fault:
+        for sweep in reversed([*(await _interrupted(session)).values()]):
+            if sweep.id not in before:
+                kept = f"{sweep.percent} % of it is kept: foveascan sweeps --resume {printable(sweep.id)}"
+                raise ScannerFault(f"{fault}; {kept}") from fault
+        raise
+
+
+async def resume(session: Session, sweep: str, silent: bool) -> str:
+    """Go on with a sweep that was cut, when the scanner is ready; the scan's id. Raises ScannerFault when it fails."""
+    published = session.published()
+    await _ready(session)
+    number = (await session.resume_sweep(sweep))["sweep"]
+    return await _followed(session, published, number, silent)
+
+
+async def _interrupted(session: Session) -> dict[str, InterruptedSweep]:
+    """The sweeps that were cut, oldest first, by id; none where the node does not say."""
+    from client.errors import NodeLost, RequestRefused
+    from protocol.errors import RemoteWireError
+
+    try:
+        return {sweep.id: sweep for sweep in await session.sweeps()}
+    except (NodeLost, RequestRefused, RemoteWireError):
+        return {}
+
+
+async def _followed(session: Session, published: News, number: int, silent: bool) -> str:
+    """The id of the scan that a sweep becomes. Raises ScannerFault when it does not."""
     import asyncio
     import time
 
@@ -75,9 +117,6 @@ async def sweep_once(session: Session, *, silent: bool) -> str:
 
     from protocol.errors import ScannerFault
 
-    published = session.published()
-    await _ready(session)
-    number = (await session.start_sweep())["sweep"]
     cut, until_s = "", 0.0
     with tqdm(total=100, unit="%", desc="sweeping", leave=False, disable=True if silent else None) as bar:
         while True:

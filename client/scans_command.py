@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from client.arguments import add_node, chosen_node
+from client.arguments import add_node, chosen_node, made
 from protocol.printable import printable
 
 if TYPE_CHECKING:
@@ -49,12 +48,4 @@ def _line(scan: ListedScan) -> str:
     shape = f"{scan.width} x {scan.height} + {scan.texture_width} x {scan.texture_height}"
     if scan.geometry != "cylinder":
         shape += f" {printable(scan.geometry)}"
-    return f"{printable(scan.id)}  {_made(scan.created)}  {shape}  {printable(scan.name)}".rstrip()
-
-
-def _made(unix_s: float) -> str:
-    """Here and now's clock; a node's may have been anywhere."""
-    try:
-        return datetime.fromtimestamp(unix_s).isoformat(" ", "minutes")
-    except (OverflowError, ValueError, OSError):
-        return "at no known time"
+    return f"{printable(scan.id)}  {made(scan.created)}  {shape}  {printable(scan.name)}".rstrip()

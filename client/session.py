@@ -11,6 +11,7 @@ import re
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any, Literal, NamedTuple, overload
+from urllib.parse import quote
 
 import aiohttp
 import msgspec
@@ -83,6 +84,38 @@ class _Started(_Scanner):
     """What is read of the answer to POST /v1/sweeps. sweep : which of the finished ones it will be."""
 
     sweep: int
+
+
+class _Resumed(msgspec.Struct):
+    """The same of the answer to POST /v1/sweeps/{sweep}/resume."""
+
+    sweep: int
+
+
+class InterruptedSweep(msgspec.Struct, rename="camel"):
+    """A sweep that was cut, as GET /v1/sweeps lists it.
+
+    started, ended : Unix time [s].  why : what cut it.  held, expected : pieces of columns.  scanner : serial number.
+    complete : whether nothing is missing, so that no scanner is needed to make a scan of it.
+    """
+
+    id: str
+    started: float
+    ended: float
+    why: str
+    held: int
+    expected: int
+    complete: bool
+    scanner: str
+    width: int
+    height: int
+    texture_width: int
+    texture_height: int
+
+    @property
+    def percent(self) -> int:
+        """How much of it is kept, rounded down."""
+        return 100 * self.held // max(self.expected, 1)
 
 
 class _Node(msgspec.Struct):
@@ -270,6 +303,21 @@ class Session:
         said = await ask(self._http, "POST", f"{self._stream.url}/v1/sweeps")
         checked(said, _Started, f"{self._stream.url} starts a sweep")
         return dict(said)
+
+    async def sweeps(self) -> list[InterruptedSweep]:
+        """The sweeps that were cut and did not become scans, oldest first."""
+        said = await ask(self._http, "GET", f"{self._stream.url}/v1/sweeps")
+        return checked(said, list[InterruptedSweep], f"{self._stream.url} lists the sweeps that were cut")
+
+    async def resume_sweep(self, sweep: str) -> dict[str, Any]:
+        """Go on with one of them: its id. Returns at once, and is followed, as `start_sweep`."""
+        said = await ask(self._http, "POST", f"{self._stream.url}/v1/sweeps/{quote(sweep, safe='')}/resume")
+        checked(said, _Resumed, f"{self._stream.url} goes on with a sweep")
+        return dict(said)
+
+    async def delete_sweep(self, sweep: str) -> None:
+        """Delete one of them for good: its id. Raises RequestRefused when there is none such."""
+        await ask(self._http, "DELETE", f"{self._stream.url}/v1/sweeps/{quote(sweep, safe='')}")
 
     async def close(self) -> None:
         """End the session; whoever still waits gets NodeLost. `connect` does this at the end of its block."""

@@ -34,7 +34,19 @@ async def fetch_scan(
     Raises ExchangeError for a suffix we do not know, what `connect` raises, and OSError; then the file is what it was
     before.
     """
-    async with _request("GET", node, f"/v1/scans/{scan}{suffix_of(path)}", token) as response:
+    return await _fetch(node, f"/v1/scans/{scan}{suffix_of(path)}", Path(path), token, moved)
+
+
+async def fetch_sweep(node: NodeAddress | str, sweep: str, path: Path, *, token: str | None = None) -> int:
+    """Write what there is of a sweep that was cut to an .npz. sweep : its id. Returns its size in bytes.
+
+    Raises what `fetch_scan` raises.
+    """
+    return await _fetch(node, f"/v1/sweeps/{sweep}.npz", path, token, lambda done, total: None)
+
+
+async def _fetch(node: NodeAddress | str, what: str, path: Path, token: str | None, moved: Moved) -> int:
+    async with _request("GET", node, what, token) as response:
         await check_granted(response)
         with whole_file(path) as file:
             async for chunk in response.content.iter_chunked(CHUNK_BYTES):

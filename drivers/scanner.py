@@ -105,7 +105,12 @@ class Scanner:
         return self._info
 
     def calibrate(self) -> Calibration:
-        """Home the table. Raises PortLost, or ScannerFault when the scanner refuses, fails or falls silent."""
+        """Home the table; after a sweep that broke, the scanner is greeted first, as in `configure`.
+
+        Raises PortLost, or ScannerFault when the scanner refuses, fails or falls silent.
+        """
+        if self._is_doubtful:
+            self.hello()
         self._send(Calibrate())
         while True:
             report = self._await_command()
@@ -145,6 +150,7 @@ class Scanner:
         collector = self._collector(header)
         for column in held:
             collector.take_column(column)
+        self._silent_s = 0.0  # an idle scanner need not have said anything until now
         collector.ask()
         yield SweepStarted(header)
         yield from self._collect(collector, stop or threading.Event())

@@ -29,7 +29,7 @@ MEDIA_TYPES: Mapping[str, str] = MappingProxyType(
         ".npz": "application/zip",
     }
 )
-NOT_CLOSED = "seen from its axis: not closed round a centre (--geometry sphere says why)"
+NOT_CLOSED = "seen from its axis: it is open, or too much of it is hidden from every centre"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".bmp")
 SIZES: Mapping[str, Size] = MappingProxyType(
     {

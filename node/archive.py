@@ -114,7 +114,9 @@ def restore(path: Path, folder: Path) -> Restored:
         except BaseException as error:
             shutil.rmtree(staged, ignore_errors=True)
             if isinstance(error, OSError):
-                raise disk_error("cannot restore the backup", error) from error
+                raise disk_error(f"cannot restore the backup {path}", error) from error
+            if isinstance(error, LibraryError):
+                raise LibraryError(f"{path}: {error}") from error
             raise
     kept = tuple(scan_id for scan_id in scan_ids if (folder / scan_id).exists())
     try:

@@ -63,7 +63,7 @@ class BackgroundWriter:
         with self._changed:
             self._changed.wait_for(lambda: not self._appending)
             while self._waiting:
-                _append(self._file, self._waiting.popleft())
+                append_whole(self._file, self._waiting.popleft())
                 self._unsafe = True
 
     def _raise_failure(self) -> None:
@@ -74,7 +74,7 @@ class BackgroundWriter:
         try:
             while (batch := self._next_batch()) is not None:
                 for piece in batch:
-                    _append(self._file, piece)
+                    append_whole(self._file, piece)
                 self._done(wrote=bool(batch))
         except OSError as error:
             with self._changed:
@@ -114,7 +114,7 @@ class BackgroundWriter:
             self._synced_s = time.monotonic()
 
 
-def _append(file: int, piece: bytes) -> None:
+def append_whole(file: int, piece: bytes) -> None:
     """Write a piece whole, or take away what of it was written and raise OSError."""
     begin, rest = os.fstat(file).st_size, memoryview(piece)
     try:

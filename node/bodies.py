@@ -226,6 +226,12 @@ class ListedSweep(_Body, frozen=True):
     texture_height: int
 
 
+class ResumedSweep(ListedSweep, frozen=True):
+    """One that goes on. sweep : which of the finished ones it will be."""
+
+    sweep: m.Count
+
+
 class AxisWanted(_Asked, frozen=True):
     """The sweep of a round body that tells where the axis is, and the body's diameter. [mm]"""
 

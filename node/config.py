@@ -224,7 +224,9 @@ def load_config(path: Path | None = None, overrides: Mapping[str, object] | None
         return msgspec.convert(settings, Config)
     except msgspec.ValidationError as problem:
         what = _in_our_words(str(problem))
-        raise (UsageError if what.partition(":")[0] in given else ConfigError)(what) from None
+        if what.partition(":")[0] in given:
+            raise UsageError(what) from None
+        raise ConfigError(f"{path}: {what}" if path else what) from None
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -124,5 +124,5 @@ def require_room(folder: Path, needed_bytes: int, what: str) -> None:
 
 def disk_error(doing: str, error: OSError) -> LibraryError:
     """What failed on the disk, as an error of the library."""
-    kind = NoRoom if error.errno in _FULL else LibraryError
-    return kind(f"{doing}: {error.strerror or error}")
+    found = f"{doing}: {error.strerror or error}"
+    return NoRoom(f"{found}; free some disk space") if error.errno in _FULL else LibraryError(found)

@@ -162,7 +162,7 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
         Endpoint("POST", "/v1/sweeps", "sweep", gives={202: _json(b.SweepAsked)}, fails=(409,), event="sweep asked"),
         Endpoint(
             "POST", "/v1/sweeps/{sweep}/resume", "go on with one that was cut",
-            gives={202: _json(b.ListedSweep)}, fails=(409,), event="sweep resumed",
+            gives={202: _json(b.ResumedSweep)}, fails=(409,), event="sweep resumed",
         ),
         Endpoint("DELETE", "/v1/sweeps/{sweep}", "drop one", gives={204: None}, event="sweep deleted"),
     )),

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.ledger import Ledger
-from node.background_writer import BackgroundWriter
+from node.background_writer import BackgroundWriter, append_whole
 from node.durable import NEW, disk_error, read_readable, read_through, require_room, sync_folder, write_whole
 from node.journal_records import (
     ENTRY_OVERHEAD,
@@ -136,7 +136,7 @@ class Journal:
             return
         self._is_closed = True
         if why is not None:
-            self._take(Fault(0, why.encode()[:150].decode(errors="ignore")))
+            self._take(_reason(why))
         failure: LibraryError | None = None
         try:
             self.flush()
@@ -214,10 +214,25 @@ class Journals:
         """Close the journal of a sweep that ended early: it is listed from now on, with all that was kept of it."""
         with suppress(LibraryError):  # whoever adds columns heard of a failing disk; here it is kept what fits
             journal.close(why)
+        path = self._path(journal.id)
         try:
-            return self._survey(self._path(journal.id))
+            sweep = self._survey(path)
+            if sweep.why == CUT_SHORT:  # the disk did not take the reason either
+                sweep = self._explain(path, sweep, why)
+            return sweep
         except OSError as error:
             raise disk_error("cannot look at what was kept of the sweep", error) from error
+
+    def _explain(self, path: Path, sweep: Interrupted, why: str) -> Interrupted:
+        """Say why a sweep ended, behind what was kept of it; where a full disk has no room for that, until we end."""
+        try:
+            with open(path, "ab", buffering=0) as file:
+                append_whole(file.fileno(), encode_record(encode_entry(_reason(why))))
+                os.fsync(file.fileno())
+            return self._survey(path)
+        except OSError:
+            self._sweeps[sweep.id] = replace(sweep, why=why)
+            return self._sweeps[sweep.id]
 
     def discard(self, journal: Journal) -> None:
         """Remove a closed journal, because its scan is kept. Raises LibraryError."""
@@ -327,6 +342,11 @@ def survey_journal(sweep_id: str, data: bytes | mmap.mmap) -> Interrupted:
     counts = ledger.held, ledger.expected, end, end - read_bytes
     said = COMPLETE if is_complete else why
     return Interrupted(sweep_id, started_unix_s, started_unix_s, info, header, *counts, said, is_complete, turn)
+
+
+def _reason(why: str) -> Fault:
+    """What ended a sweep, as its journal says it."""
+    return Fault(0, why.encode()[:150].decode(errors="ignore"))
 
 
 def _map(path: Path) -> bytes | mmap.mmap:

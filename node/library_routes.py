@@ -22,10 +22,11 @@ from contextlib import contextmanager
 from typing import BinaryIO
 
 from aiohttp import web
+from msgspec.structs import asdict
 
 from node.audit_routes import SCAN, WHAT
 from node.auth import LOGIN
-from node.bodies import ListedSweep, Verified
+from node.bodies import ListedSweep, ResumedSweep, Verified
 from node.capture import Capture, CaptureStatus
 from node.durable import NoRoom
 from node.endpoints import route
@@ -115,10 +116,10 @@ class LibraryRoutes:
 
     async def _resume(self, request: web.Request) -> web.Response:
         sweep = self._interrupted(request)
-        if self._capture is None or not self._capture.request_resume(sweep.id):
+        if self._capture is None or not (number := self._capture.request_resume(sweep.id)):
             status = self._capture.status if self._capture else CaptureStatus("no scanner")
             raise web.HTTPConflict(text=status.refusal or "the scanner was busy: try again")
-        return said(_listed(sweep), status=202)
+        return said(ResumedSweep(**asdict(_listed(sweep)), sweep=number), status=202)
 
     async def _delete_sweep(self, request: web.Request) -> web.Response:
         sweep = self._interrupted(request)

@@ -166,7 +166,8 @@ class _Picture:
         self._began = self._began or (share, now_s)
         share_0, began_s = self._began
         left_s = round((1 - share) * (now_s - began_s) / (share - share_0), 1) if share > share_0 else None
-        self._progress = m.LiveProgress(self.sweep, round(100 * share, 1), left_s)
+        percent = math.floor(1000 * share) / 10  # never more than is there
+        self._progress = m.LiveProgress(self.sweep, percent, left_s)
 
     def next(self, place: Place) -> list[LiveSaid]:
         """As Live.next: what is new in each channel, then how far the sweep is; once there is nothing, the end."""

@@ -43,7 +43,7 @@ FORGET = "() => ['frames', 'messages', 'painting', 'tasks'].forEach((list) => (b
 DRAWN = "() => bench.frames.some((frame) => frame.end !== null)"
 ANY, OF_A_SCAN = "frame", "frame of a scan"  # what the hook says when one is drawn
 AT_REST = """() => {
-  const came = Math.max(0, ...bench.messages.filter(([kind]) => kind === 'patch').map(([, at]) => at));
+  const came = Math.max(0, ...bench.messages.filter(([kind]) => kind === 'patched').map(([, at]) => at));
   return bench.frames.every(({ end }) => end !== null) && (!came || bench.frames.some(({ begin }) => begin >= came));
 }"""
 # When the parts of a page are there, from the start of the navigation. [ms]
@@ -245,7 +245,7 @@ async def _clicks(
 
 def _told_of_click(bench: dict[str, Any], spent: Spent) -> dict[str, Any]:
     """What was noted of one click; nothing where it brought nothing."""
-    patches = [(at, ms) for kind, at, ms in bench["messages"] if kind == "patch"]
+    patches = [(at, ms) for kind, at, ms in bench["messages"] if kind in ("patch", "patched")]
     if not patches:
         return {}
     clicked, looked, (came, _), answer = bench["clicked"], bench["looked"], patches[-1], bench["answer"]

@@ -287,6 +287,100 @@ def test_trouble_of_an_earlier_sweep_is_not_taken_for_this_one_s(capsys: pytest.
     assert [said["scan"] for said in json_lines(capsys.readouterr().out)] == ["fresh"]
 
 
+CUT = {
+    "id": "5d7a7f19215321eb", "started": 0, "ended": 0, "why": "unplugged\x1b", "held": 35, "expected": 100,
+    "complete": False, "damagedBytes": 0, "sizeBytes": 9, "scanner": "SIM-1", "width": 360, "height": 100,
+    "textureWidth": 1024, "textureHeight": 256,
+}  # fmt: skip
+OLDER = {**CUT, "id": "5d7a7f0000000000"}
+
+
+def cut_sweeps(*lists: list[dict[str, Any]], started: Any = None) -> tuple[web.RouteDef, ...]:
+    """What a node says of its cut sweeps, one answer after the other, the last for ever; and of going on with one."""
+    waiting = list(lists)
+
+    async def listed(request: web.Request) -> web.Response:
+        return web.json_response(waiting.pop(0) if len(waiting) > 1 else waiting[0])
+
+    async def resumed(request: web.Request) -> web.Response:
+        assert request.match_info["sweep"] == CUT["id"]
+        return web.json_response(started, status=202)
+
+    async def deleted(request: web.Request) -> web.Response:
+        return web.Response(status=204 if request.match_info["sweep"] == CUT["id"] else 404)
+
+    return (
+        web.get("/v1/sweeps", listed),
+        web.post("/v1/sweeps/{sweep}/resume", resumed),
+        web.delete("/v1/sweeps/{sweep}", deleted),
+    )
+
+
+def test_a_sweep_that_fails_names_what_is_kept_of_it() -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "ready", "why": "the disk is full"})
+    routes = (*table.routes(), *cut_sweeps([OLDER], [OLDER, CUT]))
+    kept = "the disk is full; 35 % of it is kept: foveascan sweeps --resume 5d7a7f19215321eb"
+    with serving_in_thread(greet_and_wait, *routes) as url, pytest.raises(ScannerFault, match=kept):
+        run("scan", "--node", url)
+
+
+def test_a_sweep_that_did_not_begin_takes_no_other_for_its_own() -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "ready", "why": "the disk is full"})
+    routes = (*table.routes(), *cut_sweeps([OLDER]))
+    with serving_in_thread(greet_and_wait, *routes) as url, pytest.raises(ScannerFault, match="the disk is full$"):
+        run("scan", "--node", url)
+
+
+def test_sweeps_that_were_cut_are_listed_newest_first(capsys: pytest.CaptureFixture[str]) -> None:
+    with serving_in_thread(greet_and_wait, *cut_sweeps([OLDER, CUT])) as url:
+        assert run("sweeps", "--node", url) == 0
+        first, second = capsys.readouterr().out.splitlines()
+        assert run("sweeps", "--node", url, "--json") == 0
+    assert first.startswith(f"{CUT['id']}  19") and second.startswith(str(OLDER["id"]))
+    assert first.endswith(r"  35 % of 360 x 100 + 1024 x 256  SIM-1  unplugged\x1b")
+    assert [said["held"] for said in json_lines(capsys.readouterr().out)] == [35, 35]
+    with serving_in_thread(greet_and_wait, *cut_sweeps([])) as url:
+        assert run("sweeps", "--node", url) == 0
+    assert capsys.readouterr().out == "no sweep was cut\n"
+
+
+@pytest.mark.parametrize("given", ["latest", CUT["id"], "5d7a7f1"])
+def test_a_cut_sweep_is_gone_on_with(given: str, capsys: pytest.CaptureFixture[str]) -> None:
+    table = Turntable({"phase": "ready"}, {"phase": "sweeping"}, {"phase": "ready", "sweeps": 1})
+    routes = (*table.routes(), *cut_sweeps([OLDER, CUT], started={**CUT, "sweep": 1}))
+    with serving_in_thread(table.announce, *routes) as url:
+        assert run("sweeps", "--resume", given, "--node", url, "--json") == 0
+    assert [said["scan"] for said in json_lines(capsys.readouterr().out)] == ["fresh"]
+
+
+@pytest.mark.parametrize(
+    ("given", "why"), [("5d7a7f", "several begin with '5d7a7f'"), ("5d7a", "no sweep '5d7a'"), ("x", "no sweep 'x'")]
+)
+def test_a_cut_sweep_that_is_not_the_only_one_meant_is_refused(given: str, why: str) -> None:
+    with serving_in_thread(greet_and_wait, *cut_sweeps([OLDER, CUT])) as url, pytest.raises(UsageError, match=why):
+        run("sweeps", "--resume", given, "--node", url)
+
+
+def test_a_cut_sweep_is_deleted_by_its_whole_id(capsys: pytest.CaptureFixture[str]) -> None:
+    with serving_in_thread(greet_and_wait, *cut_sweeps([OLDER, CUT])) as url:
+        assert run("sweeps", "--delete", str(CUT["id"]), "--node", url) == 0
+        with pytest.raises(RemoteWireError):
+            run("sweeps", "--delete", "latest", "--node", url)
+    assert capsys.readouterr().out == f"sweep {CUT['id']} deleted\n"
+
+
+@pytest.mark.parametrize("options", [("--fetch", "latest"), ("-o", "x.npz"), ("--fetch", "latest", "-o", "x.glb")])
+def test_what_there_is_of_a_sweep_is_fetched_as_npz_only(options: tuple[str, ...]) -> None:
+    with pytest.raises(UsageError, match=r"\.npz|--fetch ID and -o FILE"):
+        run("sweeps", *options, "--node", "http://127.0.0.1:1")
+
+
+@pytest.mark.parametrize("said", [{}, [{**CUT, "held": "x"}], [{"id": "x"}]])
+def test_what_is_no_list_of_sweeps_is_refused(said: Any) -> None:
+    with serving_in_thread(greet_and_wait, *cut_sweeps(said)) as url, pytest.raises(RemoteWireError, match="sweeps"):
+        run("sweeps", "--node", url)
+
+
 def test_a_node_without_a_scanner_is_named() -> None:
     table = Turntable({"phase": "no scanner"})
     with serving_in_thread(greet_and_wait, *table.routes()) as url, pytest.raises(ScannerFault, match="--scanner"):

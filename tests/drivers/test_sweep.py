@@ -8,7 +8,7 @@ from drivers.scanner import Scanner, ScannerConfig, SweepEvent, SweepFinished, S
 from protocol.errors import PortLost, ScannerFault
 from protocol.framing import FRAME_OVERHEAD
 from protocol.scanner_messages import COLUMN_OVERHEAD, Fault, RangeColumn, Reset, State, SweepRequest, TextureColumn
-from simulators.carriers import MemoryPort
+from simulators.carriers import MemoryPort, clean_line
 from simulators.scanner import SimulatedScanner
 from simulators.turntable import Turntable
 from tests.drivers.bench import WT, Bench, Damage, W, greeted
@@ -117,6 +117,30 @@ def test_a_sweep_that_the_scanner_forgot_does_not_go_on() -> None:
     bench.scanner._command(Reset())
     last = list(bench.scanner.resume(bench.header, held))[-1]
     assert isinstance(last, SweepInterrupted) and "refused" in last.reason
+
+
+def test_a_scanner_that_was_idle_for_long_is_heard_before_it_is_given_up() -> None:
+    bench = greeted(rate_bytes_s=300_000)
+    held = cut_at(bench, 60)
+    bench.scanner.hello()
+    bench.scanner._command(Reset())
+    until_s = bench.port.clock() + 10
+    while bench.port.clock() < until_s:
+        bench.scanner.watch(1.0)
+    last = list(bench.scanner.resume(bench.header, held))[-1]
+    assert isinstance(last, SweepInterrupted) and "refused" in last.reason
+
+
+def test_a_scanner_that_did_not_answer_whether_it_goes_on_can_be_homed() -> None:
+    bench = greeted(rate_bytes_s=300_000)
+    held = cut_at(bench, 60)
+    bench.scanner.hello()
+    bench.scanner._command(Reset())
+    bench.port._to_node = lambda data: b""
+    last = list(bench.scanner.resume(bench.header, held))[-1]
+    assert isinstance(last, SweepInterrupted) and "silent" in last.reason
+    bench.port._to_node = clean_line
+    assert bench.scanner.calibrate().calibration == bench.header.calibration
 
 
 def test_stop_ends_the_sweep_and_the_scanner_is_free_again() -> None:

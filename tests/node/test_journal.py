@@ -309,10 +309,36 @@ def test_a_disk_that_fills_up_ends_the_sweep_and_keeps_what_fits(
                 journal.add(piece)
                 journal.flush()
         sweep = journals.keep(journal, "the disk is full")
-    assert 0 < sweep.held < len(pieces)
+    assert 0 < sweep.held < len(pieces) and sweep.why == "the disk is full"
+    assert journals.get(sweep.id) == sweep, "known until the next start, though there was no room to write it down"
     assert as_bytes(journals.columns(sweep.id)) == as_bytes(pieces[: sweep.held])
     assert (tmp_path / f"{sweep.id}.sweep").stat().st_size == sweep.size_bytes
     assert [left.held for left in Journals(tmp_path).interrupted()] == [sweep.held]
+
+
+def test_why_a_full_disk_ended_a_sweep_is_written_down_as_soon_as_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really_write = os.write
+
+    def write(file: int, data: bytes) -> int:
+        if len(data) > 500:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return really_write(file, data)
+
+    journals = Journals(tmp_path)
+    journal = journals.begin(INFO, HEADER, 1e9)
+    monkeypatch.setattr(os, "write", write)
+    journal.add(columns()[0])
+    journal.flush()
+    with pytest.raises(NoRoom, match="No space left on device; free some disk space") as full:
+        while True:  # the disk is another thread's business, so the news takes a moment
+            for piece in columns():
+                journal.add(piece)
+            journal.flush()
+    sweep = journals.keep(journal, str(full.value))
+    assert (sweep.why, sweep.held) == (str(full.value), 1)
+    assert Journals(tmp_path).interrupted() == [sweep]
 
 
 def test_the_layout_on_disk_is_the_documented_one(tmp_path: Path) -> None:

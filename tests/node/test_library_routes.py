@@ -46,9 +46,9 @@ class Bench:
         """What Capture offers, as below."""
         return CaptureStatus("sweeping" if self.is_busy else "ready")
 
-    def request_resume(self, sweep_id: str) -> bool:
+    def request_resume(self, sweep_id: str) -> int:
         self.resumed.append(sweep_id)
-        return not self.is_busy
+        return 0 if self.is_busy else 3
 
     @web.middleware
     async def admit(self, request: web.Request, handler: Any) -> web.StreamResponse:
@@ -142,7 +142,8 @@ async def test_interrupted_sweeps_are_listed_resumed_and_deleted(bench: Bench, c
     (sweep,) = await (await client.get("/v1/sweeps")).json()
     assert (sweep["id"], sweep["held"], sweep["expected"], sweep["complete"]) == (bench.sweep, 4, 64, False)
     assert (sweep["why"], sweep["scanner"]) == ("unplugged", "SN-1")
-    assert (await client.post(f"/v1/sweeps/{bench.sweep}/resume")).status == 202
+    answer = await client.post(f"/v1/sweeps/{bench.sweep}/resume")
+    assert (answer.status, await answer.json()) == (202, {**sweep, "sweep": 3})
     assert bench.resumed == [bench.sweep]
     bench.is_busy = True
     assert (await client.post(f"/v1/sweeps/{bench.sweep}/resume")).status == 409

@@ -159,6 +159,12 @@ def test_progress_in_percent_and_seconds_left() -> None:
     assert progress_of(live, 1.0) == m.LiveProgress(1, 100.0, 0.0)
 
 
+def test_no_more_is_shown_than_is_there() -> None:
+    live = quiet()
+    live.watch(SweepStarted(header()))
+    assert (progress_of(live, 566 / 1384).percent, progress_of(live, 1383 / 1384).percent) == (40.8, 99.9)
+
+
 def test_what_was_kept_of_a_sweep_does_not_make_it_faster() -> None:
     now = [100.0]
     live = Live(lambda: None, clock=lambda: now[0])

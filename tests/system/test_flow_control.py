@@ -102,7 +102,7 @@ class Watched(FaultyScanner):
 def test_a_disk_slower_than_the_line_stops_the_table_and_loses_nothing(
     carrier: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    append = background_writer._append
+    append = background_writer.append_whole
     scanners: list[Watched] = []
     waits: list[bool] = []
 
@@ -111,7 +111,7 @@ def test_a_disk_slower_than_the_line_stops_the_table_and_loses_nothing(
             waits.append(scanners[0].stands.wait(60))
         append(file, piece)
 
-    monkeypatch.setattr(background_writer, "_append", slowly)
+    monkeypatch.setattr(background_writer, "append_whole", slowly)
     monkeypatch.setattr(background_writer, "WAITING_BYTES_MAX", 1 << 16)
 
     class Slow(Bench):

@@ -54,6 +54,15 @@ export interface Capture {
   [more: string]: unknown;
 }
 
+/** A sweep that was cut, and is no scan. ended: seconds since 1970; held, expected: pieces of columns. */
+export interface CutSweep {
+  id: string;
+  ended: number;
+  why: string;
+  held: number;
+  expected: number;
+}
+
 /** What is left out of a quality stands for. */
 const UNSAID: Quality = {
   coverage: 0, holes: 0, passes: 1, noiseMm: null, slipDeg: null, spikes: 0, filled: 0, requestedColumns: 0, axis: null,
@@ -69,6 +78,9 @@ export class Refused extends Error {
 
 export const listScans = (): Promise<ScanSummary[]> => ask('GET', '/v1/scans');
 export const startSweep = (): Promise<unknown> => ask('POST', '/v1/sweeps');
+export const listCutSweeps = (): Promise<CutSweep[]> => ask('GET', '/v1/sweeps');
+export const resumeSweep = (id: string): Promise<unknown> => ask('POST', `/v1/sweeps/${id}/resume`);
+export const deleteSweep = (id: string): Promise<unknown> => ask('DELETE', `/v1/sweeps/${id}`);
 export const deleteScan = (id: string): Promise<unknown> => ask('DELETE', `/v1/scans/${id}`);
 export const readCapture = async (): Promise<Capture> => (await ask<{ capture: Capture }>('GET', '/v1/node')).capture;
 export const readAccount = async (id: string): Promise<Account> => {

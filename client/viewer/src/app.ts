@@ -1,6 +1,6 @@
 // The page: panels, picture and worker, and what passes between them.
 
-import { deleteScan, listScans, readAccount, readCapture } from './api.ts';
+import { deleteScan, deleteSweep, listCutSweeps, listScans, readAccount, readCapture, resumeSweep } from './api.ts';
 import type { Sidecar } from './api.ts';
 import { Comparison } from './comparison.ts';
 import { saveCopy } from './copy.ts';
@@ -40,7 +40,9 @@ export class App {
   private readonly comparison: Comparison;
   private readonly comparePanel: ComparePanel;
   private readonly scans: ScanList;
-  private readonly scanner = new ScannerPanel(() => void this.sweep.start(), () => this.sweep.watch());
+  private readonly scanner = new ScannerPanel(() => void this.sweep.start(), () => this.sweep.watch(), {
+    resume: (id) => void this.sweep.start(() => resumeSweep(id)), drop: (id) => void this.dropSweep(id),
+  });
   private readonly look = new LookPanel(() => this.sharpen(this.pane, this.pane.stage.sight.pickMiddle()), (tool) => this.toolChanged(tool));
   private readonly measurePanel = new MeasurePanel(() => this.latest.undo(), () => this.beginMeasuring());
   private readonly display: DisplayPanel;
@@ -99,7 +101,7 @@ export class App {
       align: () => this.comparison.align(),
     });
     this.sweep = new Sweep(this.pane.stage, this.scanner, {
-      say, watched: () => this.watched(), ended: (scan) => this.sweepEnded(scan), changed: () => void this.refreshCapture(),
+      say, watched: () => this.watched(), ended: (scan) => this.sweepEnded(scan), changed: () => void Promise.all([this.refreshCapture(), this.refreshCut()]),
     });
     this.sidecar = new OpenSidecar({ say, known: (scan, sidecar) => this.takeSidecar(scan, sidecar) });
     this.scans = new ScanList((id) => this.open(id), (scan) => this.tell({ kind: 'thumbnail', scan }));
@@ -343,6 +345,7 @@ export class App {
   }
 
   private async refreshScans(): Promise<void> {
+    void this.refreshCut();
     const shown = this.panes.map((pane) => ({ pane, id: pane.info?.id }));
     try {
       if (this.scans.show(await listScans())) this.showComparison();
@@ -355,11 +358,32 @@ export class App {
   }
 
   private async refreshCapture(): Promise<void> {
+    const wasAwaited = this.sweep.isAwaited; // what was asked before the sweep was tells nothing of it
     try {
-      this.scanner.show(await readCapture());
+      const capture = await readCapture();
+      this.scanner.show(capture);
+      if (wasAwaited) this.sweep.heard(capture);
     } catch {
       return; // likewise
     }
+  }
+
+  private async refreshCut(): Promise<void> {
+    try {
+      this.scanner.cut.show(await listCutSweeps());
+    } catch {
+      return; // likewise
+    }
+  }
+
+  private async dropSweep(id: string): Promise<void> {
+    try {
+      await deleteSweep(id);
+      this.frame.say(strings.cut.dropped);
+    } catch (error) {
+      this.frame.say(strings.failed((error as Error).message));
+    }
+    await this.refreshCut();
   }
 
   // An offline copy

@@ -138,6 +138,7 @@ export class Comparison {
       case 'opened':
       case 'restored':
       case 'patch':
+      case 'patched':
       case 'updated':
       case 'refused':
       case 'traffic':

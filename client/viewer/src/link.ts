@@ -73,7 +73,9 @@ export type FromWorker =
   | { kind: 'restored' }
   | { kind: 'broken' }
   | { kind: 'recorded'; info: ScanInfo; refinements: Uint8Array<ArrayBuffer> | null }
-  | { kind: 'patch'; channel: Channel; changed: Changed[]; level: Uint8Array; isLast: boolean }
+  | { kind: 'patch'; channel: Channel; changed: Changed[]; level: Uint8Array }
+  /** What was patched is whole, and shall be seen. */
+  | { kind: 'patched' }
   | { kind: 'updated'; answer: Answer }
   | { kind: 'refused'; look: number; code: string; message: string }
   | { kind: 'published'; scan: string }

@@ -15,7 +15,7 @@ import { Stage } from './view/stage.ts';
 const PICTURE_MS = 400;
 
 /** What a worker says of the scan it has open. */
-export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'updated' | 'refused' | 'traffic' | 'broken' }>;
+export type OfScan = Extract<FromWorker, { kind: 'opened' | 'restored' | 'patch' | 'patched' | 'updated' | 'refused' | 'traffic' | 'broken' }>;
 
 export interface PaneEvents {
   say(text: string): void;
@@ -110,7 +110,9 @@ export class Pane {
         break;
       case 'patch':
         this.stage.patch(said.channel, said.changed, said.level);
-        if (said.isLast) this.stage.paintNow();
+        break;
+      case 'patched':
+        this.stage.paintNow();
         break;
       case 'updated':
         this.updated(said.answer);

@@ -1,27 +1,31 @@
 // The conversation with the node: connects, goes on after a cut, applies what comes in order, and tells the page.
 
 import { backoffMs } from './backoff.ts';
-import type { Answer, FromWorker, LinkState, LookOptions } from './link.ts';
+import type { Answer, LinkState, LookOptions } from './link.ts';
 import { LivePicture } from './live_picture.ts';
 import type { Codecs } from './protocol/codec.ts';
 import { HoldingsDiffer, RemoteWireError } from './protocol/errors.ts';
 import { TEXTURE } from './protocol/lattice.ts';
+import type { Channel } from './protocol/lattice.ts';
 import { isLive, parseLive } from './protocol/live.ts';
 import { parseMessage, PROTOCOL } from './protocol/messages.ts';
-import type { FromClient, FromNode, Look, Updated } from './protocol/messages.ts';
+import type { FromClient, FromNode, Look, ScanInfo, Updated } from './protocol/messages.ts';
 import { Model } from './protocol/model.ts';
 import type { Changed } from './protocol/model.ts';
 import { COARSE, parseRefinement } from './protocol/refinement.ts';
 import type { Refinement } from './protocol/refinement.ts';
 import { Recording } from './recording.ts';
+import { rehearse } from './rehearsal.ts';
 import { inParts, tellAll } from './telling.ts';
 import type { Tell } from './telling.ts';
 
 const CLIENT = 'foveascan viewer';
 const VIOLATION = 4002;
 const PICTURE_MS = 100;
-const TOGETHER_MS = 30;
+const TOGETHER_MS = 80;
 const TRAFFIC_MS = 500;
+/** After the first view: by then it is drawn. */
+const REHEARSAL_MS = 600;
 
 interface Looking {
   look: Look;
@@ -45,10 +49,12 @@ export class Stream {
   private wanted: string | null = null;
   /** Asked for by the page, and not told it yet. */
   private unseen = false;
-  /** Messages that have come and are not taken yet, and patches that the page shall get with what they bring. */
+  /** Messages that have come and are not taken yet. */
   private waiting = 0;
-  private patches: Extract<FromWorker, { kind: 'patch' }>[] = [];
-  private patchTimer: ReturnType<typeof setTimeout> | undefined;
+  /** The channel patched last of what the page has and does not show yet. */
+  private patched: Channel | null = null;
+  private patchedTimer: ReturnType<typeof setTimeout> | undefined;
+  private isRehearsed = false;
   private request = 0;
   private opening = 0;
   private looking: Looking | null = null;
@@ -204,40 +210,50 @@ export class Stream {
     this.recording?.add(message);
     const applyMs = performance.now() - began;
     this.applyMs += applyMs;
-    if (refinement.generator === COARSE) return this.firstView(model);
+    if (refinement.generator === COARSE) return this.firstView(model, refinement);
     if (this.looking && refinement.look === this.request) {
       this.looking.bytes += message.length;
       this.looking.applyMs += applyMs;
     }
     const { channel } = refinement;
     const level = model.holdings.channels[channel].level.slice();
-    this.patches.push(...inParts(changed).map((part) => ({ kind: 'patch', channel, changed: part, level, isLast: false }) as const));
+    for (const part of inParts(changed)) {
+      this.tell({ kind: 'patch', channel, changed: part, level }, part.map(({ cells }) => cells.buffer as ArrayBuffer));
+    }
+    this.patched = channel;
   }
 
   /**
-   * A message is done with. What belongs together and comes together is drawn at once, not one after the other: range
-   * waits a moment for its texture, or for the end of the update.
+   * A message is done with. What belongs together is drawn at once, not one after the other: range, which the page has got
+   * by then, waits a moment for its texture, or for the end of the update.
    */
   private taken(): void {
-    if (--this.waiting > 0 || !this.patches.length) return;
-    if (this.patches.some(({ channel }) => channel === TEXTURE)) this.tellPatches();
-    else this.patchTimer ??= setTimeout(() => this.tellPatches(), TOGETHER_MS);
+    if (--this.waiting > 0 || this.patched === null) return;
+    if (this.patched === TEXTURE) this.tellPatched();
+    else this.patchedTimer ??= setTimeout(() => this.tellPatched(), TOGETHER_MS);
   }
 
-  private tellPatches(): void {
-    clearTimeout(this.patchTimer);
-    this.patchTimer = undefined;
-    const patches = this.patches.splice(0);
-    patches.forEach((patch, at) => {
-      this.tell({ ...patch, isLast: at === patches.length - 1 }, patch.changed.map(({ cells }) => cells.buffer as ArrayBuffer));
-    });
+  private tellPatched(): void {
+    clearTimeout(this.patchedTimer);
+    this.patchedTimer = undefined;
+    if (this.patched !== null) this.tell({ kind: 'patched' });
+    this.patched = null;
   }
 
-  private firstView(model: Model): void {
+  private firstView(model: Model, last: Refinement): void {
     if (!model.complete) return;
+    if (last.channel === TEXTURE) this.rehearse(model.info, last);
     this.tellAll();
     this.acknowledge(model);
     if (this.looking) this.sendLook();
+  }
+
+  /** Once, when the first view is drawn. */
+  private rehearse(info: ScanInfo, texture: Refinement): void {
+    if (this.isRehearsed) return;
+    this.isRehearsed = true;
+    const isOver = () => this.looking !== null;
+    setTimeout(() => rehearse(info, texture, this.codecs, isOver).catch(console.warn), REHEARSAL_MS);
   }
 
   private close(said: Updated, size: number): void {
@@ -283,7 +299,7 @@ export class Stream {
   private answer({ look, began, bytes, applyMs }: Looking, reason: Answer['reason'], said: Updated | null): void {
     const [errorMaxMm, textureDb] = [said?.errorMaxMm ?? null, said?.textureDb ?? null];
     const elapsedMs = performance.now() - began;
-    this.tellPatches();
+    this.tellPatched();
     this.tellTraffic();
     this.tell({ kind: 'updated', answer: { look: look.request, reason, bytes, elapsedMs, nodeMs: said?.nodeMs ?? 0, applyMs, errorMaxMm, textureDb } });
   }
@@ -341,7 +357,6 @@ export class Stream {
 
   /** All that we hold of a scan whose first view is in. */
   private tellAll(): void {
-    this.patches = []; // the snapshot has them
     tellAll(this.model!, this.unseen, this.tell);
     this.tellTraffic();
     this.unseen = false;

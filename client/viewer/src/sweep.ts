@@ -1,6 +1,7 @@
 // A sweep that runs, and whether the picture shows it.
 
 import { startSweep } from './api.ts';
+import type { Capture } from './api.ts';
 import type { Snapshot } from './link.ts';
 import { thinned } from './live_picture.ts';
 import { blocksAcross, blocksDown, RANGE, TEXTURE } from './protocol/lattice.ts';
@@ -27,6 +28,8 @@ export class Sweep {
   private running: ScanInfo | null = null;
   private watched: ScanInfo | null = null;
   private startedHere = false;
+  /** We asked for one, were not refused, and have heard nothing of it yet. */
+  isAwaited = false;
 
   constructor(private readonly stage: Stage, private readonly panel: ScannerPanel, private readonly events: SweepEvents) {}
 
@@ -35,11 +38,12 @@ export class Sweep {
     return this.watched !== null;
   }
 
-  /** Have the scanner sweep; we shall want to see it. */
-  async start(): Promise<void> {
+  /** Have the scanner sweep; we shall want to see it. ask: the request, unless it is for a new one. */
+  async start(ask: () => Promise<unknown> = startSweep): Promise<void> {
     this.startedHere = true;
     try {
-      await startSweep();
+      await ask();
+      this.isAwaited = true;
       this.events.say(strings.scanner.started);
     } catch (error) {
       this.startedHere = false;
@@ -48,9 +52,19 @@ export class Sweep {
     this.events.changed();
   }
 
+  /** What the scanner did after the sweep that is awaited was asked for: it may not even have begun. */
+  heard({ phase, why }: Capture): void {
+    if (!this.isAwaited || phase === 'starting' || phase === 'sweeping') return;
+    this.isAwaited = false;
+    if (!why) return;
+    this.startedHere = false;
+    this.events.say(strings.scanner.failed(why));
+  }
+
   /** A sweep runs. It takes the picture of whoever started it, or sees nothing else; others are asked. */
   started(grid: ScanInfo, nothingElse: boolean): void {
     this.running = grid;
+    this.isAwaited = false;
     document.documentElement.dataset['live'] = 'offered';
     if (this.startedHere || nothingElse) this.watch();
     else this.panel.offer(true);
@@ -88,7 +102,7 @@ export class Sweep {
     document.documentElement.dataset['live'] = 'no';
     const showing = this.isWatched;
     this.running = this.watched = null;
-    this.startedHere = false;
+    this.startedHere = this.isAwaited = false;
     this.panel.ended();
     this.events.changed();
     this.events.say(scan ? strings.scanner.done : strings.scanner.interrupted(why));

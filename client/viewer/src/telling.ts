@@ -25,8 +25,9 @@ function tellTexels(model: Model, tell: Tell): void {
   for (let y = 0; y < height; y += most) {
     const rows = Math.min(most, height - y);
     const cells = new Uint8Array(model.texels.slice(y * width, (y + rows) * width).buffer);
-    tell({ kind: 'patch', channel: TEXTURE, changed: [{ x: 0, y, width, height: rows, cells }], level, isLast: y + rows === height }, [cells.buffer]);
+    tell({ kind: 'patch', channel: TEXTURE, changed: [{ x: 0, y, width, height: rows, cells }], level }, [cells.buffer]);
   }
+  tell({ kind: 'patched' });
 }
 
 /** What has changed, in parts that the page's own thread takes one after the other. */

@@ -6,6 +6,11 @@ import { restoreColours } from '../src/protocol/codec_colours.ts';
 import { Htj2kDecoder, LOSSLESS, mainHeader, restoreHtj2k } from '../src/protocol/codec_htj2k.ts';
 import { frameHeader, jpegQ, restoreJpeg } from '../src/protocol/codec_jpeg.ts';
 import { RemoteWireError } from '../src/protocol/errors.ts';
+import { TEXTURE } from '../src/protocol/lattice.ts';
+import type { ScanInfo } from '../src/protocol/messages.ts';
+import { COARSE } from '../src/protocol/refinement.ts';
+import type { Refinement } from '../src/protocol/refinement.ts';
+import { rehearse } from '../src/rehearsal.ts';
 import { bytes, json, sha256, words, worst } from './golden.ts';
 
 const JPEG = 1;
@@ -86,4 +91,30 @@ test('a cut or lengthened payload is refused', async () => {
     if (vector.channel === 'mask' || vector.codec === LIFT) continue;
     await assert.rejects(decode(Uint8Array.from([...payload, 0x55])), RemoteWireError, `${vector.name} +1`);
   }
+});
+
+test('a rehearsal takes in all that it made up, unless somebody waits', async () => {
+  const vector = vectors('texture').find((one) => one.codec === HTJ2K);
+  const [coarseTextureHeight, coarseTextureWidth] = vector.shape;
+  const info: ScanInfo = {
+    id: '', width: 90, height: 50, textureWidth: 4 * coarseTextureWidth, textureHeight: 4 * coarseTextureHeight, coarseWidth: 9, coarseHeight: 5,
+    coarseTextureWidth, coarseTextureHeight, stepMm: 1, pitchMm: 1, zMaxMm: 1, theta0Rad: 0,
+  };
+  const view: Refinement = {
+    generator: COARSE, channel: TEXTURE, epoch: 0, seq: 1, look: 0, codec: HTJ2K, quality: vector.quality, selfContained: false,
+    samples: coarseTextureHeight * coarseTextureWidth, parameters: null, mask: new Uint8Array(), payload: payloadOf(vector),
+  };
+  const decoded: number[] = [];
+  const counting = new Codecs(async () => decoder, () => Promise.reject(new Error('no JPEG')));
+  const ranges = counting.ranges.bind(counting);
+  counting.ranges = async (...asked) => {
+    const images = await ranges(...asked);
+    decoded.push(images[0]!.length);
+    return images;
+  };
+  await rehearse(info, view, counting, () => false);
+  assert.ok(decoded.filter((samples) => samples > 70_000).length >= 4);
+  decoded.length = 0;
+  await rehearse(info, view, counting, () => true);
+  assert.deepEqual(decoded, [64 * 64]);
 });

@@ -16,7 +16,20 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from foveascan import started
-from tests.client.viewer.browser import blank, click, crop, opened, psnr, wait_drawn, wait_updates
+from node.journal import Journals
+from protocol.grid import GridSpec
+from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepHeader
+from tests.client.viewer.browser import (
+    barriers,
+    blank,
+    click,
+    crop,
+    layout_faults,
+    opened,
+    psnr,
+    wait_drawn,
+    wait_updates,
+)
 from tests.system.line import RunningNode, run_line
 
 FAST = ("--link-rate", "20000000")
@@ -253,6 +266,48 @@ def test_a_sweep_of_somebody_else_is_offered_and_takes_no_picture_away(browser: 
             page.get_by_role("button", name="Watch the sweep").click()
             page.wait_for_selector('html[data-live="yes"]', state="attached")
             page.wait_for_selector('html[data-live="no"]', state="attached")
+
+
+def keep_cut_sweeps(folder: Path) -> None:
+    """Two sweeps of a scanner that is not there, a sixth of the one and a third of the other."""
+    header = SweepHeader(7, GridSpec(8, 6, 16, 6, step_mm=0.05, pitch_mm=1.0), 3200, range_rows=6, texture_rows=6)
+    journals = Journals(folder / "sweeps")
+    for count in (4, 8):
+        journal = journals.begin(DeviceInfo("ELSEWHERE", 1, 3200, 10), header, 1e9 + count)
+        for column in range(count):
+            journal.add(RangeColumn(7, 0, column, 0, 400 * column, 1, bytes(12)))
+        journals.keep(journal, "somebody fell over the plug")
+
+
+def test_a_cut_sweep_is_told_with_what_can_become_of_it(browser: Browser, tmp_path: Path) -> None:
+    keep_cut_sweeps(tmp_path / "library")
+    with ExitStack() as stack:
+        _, ready = stack.enter_context(started("simulate", "--path", str(tmp_path / "scanner"), "--json"))
+        serve = ["serve", "--scanner", ready["path"], "--library", str(tmp_path / "library"), "--insecure", "--json"]
+        _, at = stack.enter_context(started(*serve, "--listen", "127.0.0.1:0"))
+        page, problems = stack.enter_context(blank(browser))
+        page.goto(at["url"])
+        cut = page.get_by_role("list", name="Sweeps that were cut").get_by_role("listitem")
+        cut.nth(1).wait_for()
+        third, sixth = (cut.nth(number).text_content() or "" for number in (0, 1))
+        assert third.startswith("33 % kept, ") and sixth.startswith("16 % kept, ")
+        assert "somebody fell over the plug" in third
+        for width in (1000, 360):
+            page.set_viewport_size({"width": width, "height": 700})
+            assert barriers(page) == [] and layout_faults(page) == []
+        page.set_viewport_size({"width": 1000, "height": 700})
+        page.get_by_role("button", name="Go on with the sweep: 33 % kept").click(timeout=20_000)
+        why = "it was begun by scanner ELSEWHERE, this is SIM-0001"
+        page.locator("#notice").get_by_text(f"There is no scan of it: sweep interrupted: {why}").wait_for()
+        page.get_by_text(f"Ready. Last trouble: sweep interrupted: {why}").wait_for()
+        page.get_by_role("button", name="Delete the sweep: 16 % kept").click()
+        page.get_by_role("button", name="Keep it").click()
+        assert cut.count() == 2
+        page.get_by_role("button", name="Delete the sweep: 16 % kept").click()
+        page.get_by_role("button", name="Delete it").click()
+        page.locator("#notice").get_by_text("The sweep is deleted.").wait_for()
+        cut.nth(1).wait_for(state="detached")
+        assert (cut.text_content() or "").startswith("33 % kept") and problems == []
 
 
 def watch_a_sweep(page: Page) -> None:

@@ -9,10 +9,10 @@ import { decodeColours } from './codec_colours.ts';
 import { LOSSLESS } from './codec_htj2k.ts';
 import type { Htj2kDecoder } from './codec_htj2k.ts';
 
-const RAW = 0;
+export const RAW = 0;
 const JPEG = 1;
 export const HTJ2K = 2;
-const LIFT = 3;
+export const LIFT = 3;
 const SIDE_MAX = 16384;
 const SAMPLES_MAX = 1 << 25;
 const STEPS_MAX = 65535;

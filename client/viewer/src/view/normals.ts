@@ -10,12 +10,11 @@ import { compile } from './compile.ts';
 import type { Uniforms } from './grid_mesh.ts';
 import { COPY_FRAGMENT, definesOf, NORMALS_FRAGMENT, QUAD_VERTEX } from './shaders.ts';
 
-/** Differences of a normal reach this far beyond the samples that changed. */
-export const NORMALS_REACH = 24;
-
 type Rectangle = Omit<Changed, 'cells'>;
 
 export class Normals {
+  /** So far from samples that change, normals may. */
+  readonly reach: number;
   private target: WebGLRenderTarget;
   private due: 'all' | Rectangle[] = 'all';
   private readonly pass: Pass;
@@ -23,14 +22,17 @@ export class Normals {
 
   /**
    * uniforms: of the surface; `uNormals` among them is kept up to date. level: of range, by 8 x 8 blocks.
-   * spacing: between the samples held, at least: a texture as coarse as half of that shows as much, and is drawn sooner.
+   * spacing: between the samples held, at least and at most: a texture as coarse as half the least shows as much, and is
+   * drawn sooner.
    * thinned: every how many-th sample is there to be drawn.
    */
   constructor(
     private readonly renderer: WebGLRenderer, private readonly width: number, private readonly height: number, private readonly thinned: number,
-    private readonly uniforms: Uniforms, private readonly sphere: boolean, level: DataTexture, spacing: number,
+    private readonly uniforms: Uniforms, private readonly sphere: boolean, level: DataTexture, spacing: readonly [least: number, most: number],
   ) {
-    const stride = Math.max(thinned, spacing / 2);
+    const stride = Math.max(thinned, spacing[0] / 2);
+    // A sphere's samples are means of those beside them, as far again.
+    this.reach = Math.ceil(Math.max(thinned, spacing[1])) * (sphere ? 2 : 1) + 1;
     this.pass = new Pass(NORMALS_FRAGMENT, sphere, { ...uniforms, uLevel: { value: level }, uCell: { value: new Vector2(1, 1) } });
     this.copy = new Pass(COPY_FRAGMENT, false, { uFrom: { value: null }, uTo: { value: this.whole } });
     this.target = targetOf(Math.ceil(width / stride), Math.ceil(height / stride));
@@ -88,7 +90,7 @@ export class Normals {
   }
 
   private draw({ x, y, width, height }: Rectangle): void {
-    const [top, bottom] = [Math.max(0, y - NORMALS_REACH), Math.min(this.height, y + height + NORMALS_REACH)];
+    const [top, bottom] = [Math.max(0, y - this.reach), Math.min(this.height, y + height + this.reach)];
     const reach = this.reachRound(top, bottom);
     const [left, right] = [Math.max(0, x - reach), Math.min(this.width, x + width + reach)];
     this.render(this.pass, left, top, right, bottom);
@@ -98,9 +100,9 @@ export class Normals {
 
   /** The same round: on a sphere, columns of these rows are as narrow as the ring next to a pole is short. */
   private reachRound(top: number, bottom: number): number {
-    if (!this.sphere) return NORMALS_REACH;
+    if (!this.sphere) return this.reach;
     const ring = Math.min(Math.sin((Math.PI * top) / this.height), Math.sin((Math.PI * bottom) / this.height));
-    return Math.min(Math.ceil(NORMALS_REACH / Math.max(ring, 1e-6)), this.width);
+    return Math.min(Math.ceil(this.reach / Math.max(ring, 1e-6)), this.width);
   }
 
   dispose(): void {

@@ -20,7 +20,7 @@ import type { Detail } from './tiles.ts';
 
 const HARDWARE: Detail = { tileSide: 64, cellPx: 2, awayFactor: 1, trianglesMax: 3e6 };
 /** Fewer, larger tiles: a processor spends more on each one than on its triangles. */
-const SOFTWARE: Detail = { tileSide: 128, cellPx: 7, awayFactor: 4, trianglesMax: 1.5e5 };
+const SOFTWARE: Detail = { tileSide: 128, cellPx: 14, awayFactor: 2, trianglesMax: 1.5e5 };
 /** Drawn larger than shown, so that edges are smooth. */
 const SMOOTH_RATIO = 1.5;
 const SLOW_FRAME_MS = 40;
@@ -139,6 +139,7 @@ export class Stage {
   patch(channel: Channel, changed: Changed[], level: Uint8Array): void {
     const before = this.partOf(channel, changed);
     this.surface?.patch(channel, changed, level);
+    if (channel === RANGE && this.isWarm) this.surface?.drawNormals(); // texture is still to come: the card can begin
     const after = channel === RANGE ? this.partOf(channel, changed) : before; // colour moves nothing
     this.change(before === 'all' || after === 'all' ? 'all' : joined(before, after));
   }

@@ -14,7 +14,7 @@ import { evened } from './coarse_colours.ts';
 import { compile } from './compile.ts';
 import { fan, fill, gridMesh, tileGrid } from './grid_mesh.ts';
 import type { GridMesh, Uniforms } from './grid_mesh.ts';
-import { Normals, NORMALS_REACH } from './normals.ts';
+import { Normals } from './normals.ts';
 import { joined, partOf } from './repaint.ts';
 import type { Part } from './repaint.ts';
 import { isSphere } from './room.ts';
@@ -114,6 +114,12 @@ export class Surface {
     else this.patchTexels(changed);
   }
 
+  /** Have the card draw the normals of what has changed. */
+  drawNormals(): void {
+    this.normals.drawDue();
+    this.renderer.getContext().flush();
+  }
+
   /** Show another picture of the same shape, as while a sweep runs. */
   replace(steps: Uint16Array, coarseTexels: Uint8Array): void {
     this.steps.set(steps);
@@ -160,7 +166,7 @@ export class Surface {
     if (isSphere(this.info) || !this.normals.isFull) return 'all';
     let part: Part | null = null;
     for (const rectangle of changed) {
-      const cells = channel === RANGE ? grown(rectangle, NORMALS_REACH) : this.cellsOf(rectangle);
+      const cells = channel === RANGE ? grown(rectangle, this.normals.reach) : this.cellsOf(rectangle);
       const [finest, coarsest] = this.tiles.strides(grown(cells, 2 * STRIDES.at(-1)!));
       const seen = partOf(this.info, this.steps, grown(cells, 2 * coarsest), finest, camera, width, height);
       if (seen === 'all') return seen;
@@ -283,7 +289,9 @@ function grown({ x, y, width, height }: Omit<Changed, 'cells'>, by: number): Omi
   return { x: x - by, y: y - by, width: width + 2 * by, height: height + 2 * by };
 }
 
-/** Samples from one that is held to the next, where they are densest. level: twice the logarithm of that. */
-function spacingOf(level: Uint8Array): number {
-  return 2 ** Math.floor(level.reduce((least, one) => Math.min(least, one), 255) / 2);
+/** Samples from one that is held to the next, where they are densest, and where least dense. level: twice the logarithm of that. */
+function spacingOf(level: Uint8Array): [least: number, most: number] {
+  const least = level.reduce((least, one) => Math.min(least, one), 255);
+  const most = level.reduce((most, one) => Math.max(most, one), 0);
+  return [2 ** Math.floor(least / 2), 2 ** (most / 2)];
 }
