@@ -30,12 +30,16 @@ AnyUpdate = Update | Planned | ClassicUpdate
 
 @dataclass(slots=True, eq=False)
 class Bound:
-    """One opening of a scan. state : what the client holds, as we believe.  next_seq : of the next refinement."""
+    """One opening of a scan. state : what the client holds, as we believe.  next_seq : of the next refinement.
+
+    begun : how many refinements of an update that is being planned are sent.
+    """
 
     epoch: int
     scan: Scan
     state: ClientState | ClassicState
     next_seq: int = 0
+    begun: int = 0
 
     def plan(
         self,
@@ -48,6 +52,7 @@ class Bound:
         range_model: RangeModel | None = None,
         hurried: bool = False,
         pool: Executor | None = None,
+        ready: Callable[[Sequence[Coded]], None] | None = None,
     ) -> Update | ClassicUpdate:
         """The update that answers a look; arguments as for plan_update. codecs : what the client takes, best first.
 
@@ -64,17 +69,27 @@ class Bound:
             plan_update, self.scan, self.state, look, budget_bytes=budget_bytes, superseded=superseded, model=model,
             quick=quick, range_model=range_model, hurried=hurried, pool=pool,
         )  # fmt: skip
+        if codec == "htj2k" or "htj2k" not in codecs:
+            return plan(codec, ready=ready)
         update = plan(codec)
-        if codec == "htj2k" or "htj2k" not in codecs or not _falls_short(update, look):
+        if not _falls_short(update, look):
             return update
         better = plan("htj2k")
         return replace(better, encodes=update.encodes + better.encodes)
 
+    def begin(self, coded: Sequence[Coded], look: m.Look) -> list[bytes]:
+        """Count what an update begins with as sent, while the rest is planned; returns it as `take` does."""
+        self.begun = len(coded)
+        return self._numbered(coded, look)
+
     def take(self, update: AnyUpdate, look: m.Look) -> list[bytes]:
-        """Count an update as sent; returns its refinements on the wire, in order."""
-        coded: tuple[Coded | Packed | ClassicCoded, ...] = update.coded
-        refinements = [one.refinement(self.epoch, seq, look.request) for seq, one in enumerate(coded, self.next_seq)]
+        """Count an update as sent; returns its refinements on the wire, in order, but those it was begun with."""
+        rest, self.begun = update.coded[self.begun :], 0
         self.state = update.state
+        return self._numbered(rest, look)
+
+    def _numbered(self, coded: Sequence[Coded | Packed | ClassicCoded], look: m.Look) -> list[bytes]:
+        refinements = [one.refinement(self.epoch, seq, look.request) for seq, one in enumerate(coded, self.next_seq)]
         self.next_seq += len(coded)
         return [refinement.to_bytes() for refinement in refinements]
 

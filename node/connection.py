@@ -12,17 +12,20 @@ import logging
 import re
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
+from node.ahead import Ahead
 from node.audit import Audit, Who
 from node.auth import Login
 from node.bound import AnyUpdate, Bound, updated
 from node.bucket import Bucket
+from node.coded import Coded
 from node.exhibits import Exhibits
 from node.foveate import Update
 from node.live import Live, Place
@@ -94,6 +97,7 @@ class Connection:
         self._work = asyncio.Event()
         self._acknowledged = asyncio.Event()
         self._sent_bytes, self._sent_s = 0, 0.0
+        self._is_timed = True
 
     async def run(self) -> None:
         """Serve until the client goes. Never raises for what the client does."""
@@ -234,7 +238,7 @@ class Connection:
         bound = self._bound
         if bound is None or ack.epoch != bound.epoch or ack.next_seq != bound.next_seq:
             return  # of an update that a newer opening has overtaken
-        if not self._acknowledged.is_set():
+        if not self._acknowledged.is_set() and self._is_timed:
             self._rate.acknowledged(self._sent_bytes, time.monotonic() - self._sent_s, ack.apply_ms / 1000)
             self._metrics.measured(self._rate.bandwidth_bytes_s)
         if ack.digest != bound.state.holdings.digest():
@@ -319,13 +323,16 @@ class Connection:
         if bound is None:
             why = "the scan was deleted: open another" if self._is_gone else "open a scan first"
             return m.Refused(look.request, "not open", why)
-        self._running_look = look
+        self._running_look, state = look, bound.state
         try:
             update = await self._plan(bound, look, hurried)
         except (LatticeError, CodecError) as error:
+            await self._call_off(bound)
             return m.Refused(look.request, "bad request", str(error)[:500])
         finally:
-            still_wanted, self._running_look = self._running_look is look, None
+            still_wanted, self._running_look = self._running_look is look or bound.begun > 0, None
+        if bound.state is not state:  # the client has objected to what came ahead
+            bound.begun, still_wanted = 0, False
         self._gave_way = update.reason == "superseded"
         return self._superseded(look) if self._gave_way or not still_wanted else update
 
@@ -344,6 +351,7 @@ class Connection:
         if hurried:
             self._metrics.hurried()
         pool = None if hurried else self._exhibits.idle_pool()
+        ahead = Ahead(superseded)
 
         def job() -> AnyUpdate:
             if hurried:
@@ -352,13 +360,37 @@ class Connection:
                 )
                 if planned is not None:
                     return planned
-            update = bound.plan(look, self._codecs, budget, superseded, models[0], quick, models[1], hurried, pool)
+            update = bound.plan(
+                look, self._codecs, budget, ahead.superseded, models[0], quick, models[1], hurried, pool,
+                None if pool is None else ahead.send,
+            )  # fmt: skip
             return update.settled() if pool is None and isinstance(update, Update) else update
 
-        return await self._exhibits.work(job, "look")
+        planning = asyncio.ensure_future(self._exhibits.work(job, "look"))
+        try:
+            either: set[asyncio.Future[Any]] = {planning, ahead.first}
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+            if ahead.first.done():
+                await self._send_ahead(bound, look, ahead.first.result())
+            return await planning
+        finally:
+            planning.cancel()
+
+    async def _send_ahead(self, bound: Bound, look: m.Look, coded: Sequence[Coded]) -> None:
+        """Send what an update begins with while the rest is planned. How long that takes says nothing of the link."""
+        self._acknowledged.clear()
+        self._is_timed = False
+        for refinement in bound.begin(coded, look):
+            await self._send_bytes(refinement)
+
+    async def _call_off(self, bound: Bound) -> None:
+        """There is no end of an update that was begun: the client shall say what it holds."""
+        if bound.begun:
+            bound.begun = 0
+            await self._send(m.Resync(bound.epoch, "an update could not be ended"))
 
     async def _send_update(self, bound: Bound, look: m.Look, update: AnyUpdate, spent_s: float) -> None:
-        if update.coded:
+        if update.coded and not bound.begun:
             self._acknowledged.clear()
             self._begin_timing()
         for refinement in bound.take(update, look):  # counts all of them at once, as what is said meanwhile must
@@ -380,7 +412,7 @@ class Connection:
     # -- writing ---------------------------------------------------------------------------------------------------
 
     def _begin_timing(self) -> None:
-        self._sent_bytes, self._sent_s = 0, time.monotonic()
+        self._sent_bytes, self._sent_s, self._is_timed = 0, time.monotonic(), True
 
     async def _send(self, said: m.FromNode | LiveColumns) -> None:
         if self._session.phase is Phase.CLOSED:

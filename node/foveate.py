@@ -9,7 +9,7 @@ Source: Cheng, Basu, Pan 2003, Eq. (15), with REQUIREMENTS F-14 and F-14b.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -114,6 +114,7 @@ def plan_update(
     range_model: RangeModel | None = None,
     hurried: bool = False,
     pool: Executor | None = None,
+    ready: Callable[[Sequence[Coded]], None] | None = None,
 ) -> Update:
     """Plan the update that answers a look.
 
@@ -122,10 +123,11 @@ def plan_update(
     model : what the scan's texture takes, where that is known by now.   quick : spare time rather than bytes.
     range_model : what its range misses, likewise.   hurried : others wait, so spare what a few percent of bytes buy.
     pool : a free thread of it plans range meanwhile, where that does not depend on what texture takes.
+    ready : told the refinements of range, with which the update begins, as soon as these are there in that case.
     Raises LatticeError or CodecError where explicit parameters do not fit the scan.
     """
     planner = _Planner(
-        scan, state.copy(), look, codec, budget_bytes, superseded, model, quick, range_model, hurried, pool
+        scan, state.copy(), look, codec, budget_bytes, superseded, model, quick, range_model, hurried, pool, ready
     )
     try:
         planner.run()
@@ -150,9 +152,10 @@ class _Planner:
         range_model: RangeModel | None,
         hurried: bool,
         pool: Executor | None,
+        ready: Callable[[Sequence[Coded]], None] | None,
     ) -> None:
         self._scan, self._state, self._look, self._codec, self._quick = scan, state, look, codec, quick
-        self._pool = pool
+        self._pool, self._ready = pool, ready
         self._left = math.inf if budget_bytes is None else float(budget_bytes - REPLY_BYTES)
         self._spare = 0.0 if budget_bytes is None else (1 - FILL) * budget_bytes
         self._encodes = {channel: Encodes(superseded) for channel in Channel}  # each counted by one thread
@@ -197,7 +200,10 @@ class _Planner:
             self._take(coded)
 
     def _reach_range(self) -> list[Coded]:
-        return self._range.reach(self._range.choose(self._range.target_steps))
+        found = self._range.reach(self._range.choose(self._range.target_steps))
+        if self._ready is not None:
+            self._ready(found)
+        return found
 
     def _run_within(self) -> None:
         """Choose, encode and note what fits the budget; in turn, since each takes what the other leaves."""

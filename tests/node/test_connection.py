@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import threading
 import time
 import weakref
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,10 @@ from node import connection
 from node.bound import Bound
 from node.library import About, Library
 from node.serve import HEARTBEAT_S
+from node.texture_search import TextureSearch
 from protocol import messages as m
 from protocol.codec import TextureCodec
+from protocol.errors import CodecError
 from protocol.holdings import Holdings
 from protocol.lattice import Channel
 from protocol.refinement import Refinement
@@ -113,6 +116,85 @@ async def test_a_client_that_likes_jpeg_gets_better_texture_than_that_has(
     assert (texture.channel, texture.codec) == (Channel.TEXTURE, codec)
     ended = m.decode_message((await stream.receive()).data)
     assert isinstance(ended, m.Updated) and ended.texture_db is not None and ended.texture_db >= texture_db
+    await stream.close()
+
+
+@pytest.fixture
+def held_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Texture is planned once this is set."""
+    go_on, search = threading.Event(), TextureSearch.search
+
+    def patiently(self: TextureSearch, aim_bytes: float, limit_bytes: float) -> Any:
+        assert go_on.wait(60)
+        return search(self, aim_bytes, limit_bytes)
+
+    monkeypatch.setattr(TextureSearch, "search", patiently)
+    yield go_on
+    go_on.set()
+
+
+async def said(stream: ClientWebSocketResponse, *messages: m.FromClient) -> None:
+    """Say something, and wait until the node has heard it."""
+    for message in (*messages, m.Envelope(9)):
+        await stream.send_str(m.encode_message(message))
+    assert isinstance(m.decode_message((await stream.receive()).data), m.Enveloped)
+
+
+async def begun(stream: ClientWebSocketResponse, request: int) -> None:
+    """Look, and have the range of it."""
+    await stream.send_str(m.encode_message(m.Look(request, 0.75, 0.5, texture_db=32)))
+    first = Refinement.from_bytes((await stream.receive()).data)
+    assert (first.channel, first.seq, first.look) == (Channel.RANGE, 2, request)
+
+
+async def test_range_is_sent_while_texture_is_planned_and_then_no_look_is_given_up(
+    node: Client, held_up: threading.Event
+) -> None:
+    stream, answer = await opened(node)
+    await stream.send_str(m.encode_message(state(answer, 2)))
+    await begun(stream, 2)
+    await said(stream, m.Cancel(2), m.Look(3, 0.2, 0.5))
+    held_up.set()
+    texture = Refinement.from_bytes((await stream.receive()).data)
+    assert (texture.channel, texture.seq, texture.look) == (Channel.TEXTURE, 3, 2)
+    ended = m.decode_message((await stream.receive()).data)
+    assert isinstance(ended, m.Updated)
+    assert (ended.request, ended.next_seq, ended.reason) == (2, 4, "complete")
+    await stream.close()
+
+
+async def test_a_look_whose_range_a_client_objects_to_is_dropped(node: Client, held_up: threading.Event) -> None:
+    stream, answer = await opened(node)
+    await stream.send_str(m.encode_message(state(answer, 2)))
+    await begun(stream, 2)
+    await said(stream, state(answer, 2))
+    held_up.set()
+    dropped = m.decode_message((await stream.receive()).data)
+    assert isinstance(dropped, m.Updated)
+    assert (dropped.request, dropped.next_seq, dropped.reason) == (2, 2, "superseded")
+    await begun(stream, 3)
+    await stream.close()
+
+
+async def test_an_update_that_cannot_be_ended_costs_no_stream(
+    node: Client, held_up: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream, answer = await opened(node)
+    await stream.send_str(m.encode_message(state(answer, 2)))
+    patiently = TextureSearch.search
+
+    def fail(self: TextureSearch, aim_bytes: float, limit_bytes: float) -> Any:
+        patiently(self, aim_bytes, limit_bytes)
+        raise CodecError("it fails")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(TextureSearch, "search", fail)
+        await begun(stream, 2)
+        held_up.set()
+        told = [m.decode_message((await stream.receive()).data) for _ in range(2)]
+    assert [type(one) for one in told] == [m.Resync, m.Refused]
+    await stream.send_str(m.encode_message(state(answer, 2)))
+    await begun(stream, 3)
     await stream.close()
 
 

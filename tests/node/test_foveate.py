@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from client.model import Model
 from node import refine_range
+from node.coded import Coded
 from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.foveate import REPLY_BYTES, Update, plan_update
 from node.library import Scan
@@ -138,6 +140,15 @@ def test_a_second_thread_changes_nothing(scan: Scan, view: FirstView, explicit: 
     assert [coded.payload for coded in beside.coded] == [coded.payload for coded in alone.coded]
     assert (beside.reason, beside.encodes, beside.texture_db) == (alone.reason, alone.encodes, alone.texture_db)
     assert beside.settled().state.holdings.digest() == alone.settled().state.holdings.digest()
+
+
+def test_range_is_told_before_the_update_that_begins_with_it(scan: Scan, view: FirstView) -> None:
+    told: list[Sequence[Coded]] = []
+    with ThreadPoolExecutor(1) as pool:
+        update = plan_update(scan, view.state, Look(1, 0.62, 0.3), "htj2k", pool=pool, ready=told.append)
+    ((*first,),) = told
+    assert first and all(coded.channel is Channel.RANGE for coded in first)
+    assert update.coded[: len(first)] == tuple(first)
 
 
 def test_says_the_largest_error_left_in_the_window(scan: Scan, view: FirstView) -> None:
