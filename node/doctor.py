@@ -30,8 +30,9 @@ from node.access import FOLDER
 from node.advertise import HEARD_S, is_heard
 from node.audit import FOLDER as AUDIT
 from node.durable import EASY_BYTES
-from node.identity import node_identity
+from node.identity import known_identity
 from node.library import survey
+from node.library_folder import holder_of
 from node.machine import (
     ACCOUNT,
     READ,
@@ -99,14 +100,16 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     yield Finding("configuration", "ok", str(path) if path else "the defaults: no file was named")
     account, port = node_account(), config.capture.scanner
     who = _who_answers(config.server)
-    yield check_port(port, is_used=who == "node")
+    holder = holder_of(library)
+    runs = who == "node" and holder != 0  # the node of these settings, as far as can be seen
+    yield check_port(port, is_used=runs)
     yield check_permission(port, account)
-    yield check_server(config.server, who)
+    yield check_server(config.server, who, holder)
     yield check_certificate(config.server, library, dt.datetime.now(dt.UTC), account)
     yield check_disk(library, account)
     yield check_memory(available_bytes())
     yield check_clock(time.time(), written_last_s(Path(__file__), library), is_clock_synchronised())
-    yield check_discovery(config, who == "node")
+    yield check_discovery(config, runs)
     yield check_library(library)
     yield check_audit(library, account)
 
@@ -198,8 +201,17 @@ def check_permission(port: str | None, account: Account) -> Finding:
     return Finding("permission", "problem", found, rule if account.name == ACCOUNT else f"{rule}; {join}")
 
 
-def check_server(server: settings.Server, who: str) -> Finding:
-    """Whether the address can be served. who : "node", "other" or "nobody" answers there."""
+def check_server(server: settings.Server, who: str, holder: int | None = None) -> Finding:
+    """Whether the address can be served.
+
+    who : "node", "other" or "nobody" answers there.  holder : the process that works in the library, 0: none.
+    """
+    if who == "node" and holder == 0:
+        cure = "stop it, or choose another server.listen; or name its own library"
+        return Finding("server", "problem", f"a node with another library answers at {server.listen}", cure)
+    if who == "nobody" and holder:
+        found = f"process {holder} works in the library, and no node answers at {server.listen}"
+        return Finding("server", "warning", found, "if it is a node, name its own address: --listen, or its --config")
     if who == "node":
         return Finding("server", "ok", f"a node answers at {server.listen}")
     if who == "other":
@@ -308,7 +320,7 @@ def check_discovery(config: settings.Config, is_running: bool) -> Finding:
     if not config.discovery.enabled:
         return Finding("discovery", "ok", "switched off", "set discovery.enabled = true, to be found")
     try:
-        heard = is_heard(config.server.host, node_identity(config.library.path) if is_running else None)
+        heard = is_heard(config.server.host, known_identity(config.library.path) if is_running else None)
     except (OSError, LibraryError) as error:
         cure = "connect a network, or set discovery.enabled = false"
         return Finding("discovery", "problem", f"multicast DNS cannot be used: {error}", cure)

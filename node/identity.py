@@ -15,11 +15,23 @@ FILE_BYTES_MAX = 64
 
 def node_identity(folder: Path) -> str:
     """The id kept in a folder, 16 hex digits; drawn and written the first time. Raises LibraryError."""
+    if (known := known_identity(folder)) is not None:
+        return known
+    drawn, path = secrets.token_hex(8), folder / FILE
+    try:
+        write_whole(path, drawn.encode())
+    except OSError as error:
+        raise LibraryError(f"{path}: {error.strerror}") from error
+    return drawn
+
+
+def known_identity(folder: Path) -> str | None:
+    """The id kept in a folder; None where none was drawn yet. Raises LibraryError."""
     path = folder / FILE
     try:
-        if not path.exists():
-            write_whole(path, secrets.token_hex(8).encode())
         text = read_bounded(path, FILE_BYTES_MAX).decode(errors="replace").strip()
+    except FileNotFoundError:
+        return None
     except OSError as error:
         raise LibraryError(f"{path}: {error.strerror}") from error
     if not re.fullmatch("[0-9a-f]{16}", text):

@@ -33,6 +33,7 @@ TRASH, RESTORE = ".trash-", ".restore-"
 UNFINISHED = (INCOMING, TRASH, RESTORE)
 CHECKED = "checked"  # in a .restore- folder: everything in it was unpacked and found sound
 SCAN_FILES = frozenset({RANGE_FILE, TEXTURE_FILE, REPAIRS_FILE, RECORD_FILE, SIDECAR_FILE})
+LOCKS = Path("/proc/locks")
 _MARK_BYTES_MAX = 4096
 
 
@@ -66,6 +67,22 @@ class Lock:
 
     def __del__(self) -> None:
         self.release()
+
+
+def holder_of(folder: Path) -> int | None:
+    """Which process works in a library: its id, 0 for nobody, None where that cannot be seen. No lock is taken."""
+    try:
+        inode = str((folder / LOCK_FILE).stat().st_ino)
+    except FileNotFoundError:
+        return 0
+    except OSError:
+        return None
+    try:
+        locks = [line.split() for line in LOCKS.read_text().splitlines()]
+    except OSError:
+        return None
+    holders = [lock[4] for lock in locks if lock[1:2] == ["FLOCK"] and lock[5].rpartition(":")[2] == inode]
+    return int(holders[0]) if holders else 0 if locks else None
 
 
 def check_format(folder: Path) -> None:

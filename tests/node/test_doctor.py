@@ -18,11 +18,12 @@ import pytest
 
 import foveascan
 from node import config as settings
-from node import doctor, machine
+from node import doctor, library_folder, machine
 from node.access import access_folder
 from node.audit import done_trail
 from node.doctor import Finding
 from node.durable import EASY_BYTES
+from node.identity import node_identity
 from node.library import About, Library
 from node.machine import Account
 from node.tls import renew_own
@@ -194,6 +195,49 @@ def test_a_node_is_known_whether_it_serves_tls_or_not() -> None:
         thread.join()
 
 
+def test_a_node_with_another_library_is_not_the_one_that_is_meant(tmp_path: Path, port: str) -> None:
+    library = Library(tmp_path / "ours")
+    meant = {"capture.scanner": port, "library.folder": str(tmp_path / "ours")}
+    with answering(b'{"status": "ready"}') as node:
+        thread = Thread(target=node.serve_forever)
+        thread.start()
+        settled = {**meant, "server.listen": f"127.0.0.1:{node.server_port}", "discovery.enabled": False}
+        told = {finding.check: finding for finding in doctor.examine(None, settled)}
+        assert (told["server"].state, told["port"].found) == ("ok", f"{port}, in use by the node")
+        library.close()
+        told = {finding.check: finding for finding in doctor.examine(None, settled)}
+        assert (told["server"].state, told["port"].found) == ("problem", port)
+        assert "another library" in told["server"].found
+        elsewhere = {**settled, "library.folder": str(tmp_path / "not" / "there")}
+        assert {finding.check: finding for finding in doctor.examine(None, elsewhere)}["server"].state == "problem"
+        node.shutdown()
+        thread.join()
+
+
+def test_a_node_at_another_address_is_told(tmp_path: Path) -> None:
+    library = Library(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        nobody = f"127.0.0.1:{free.getsockname()[1]}"
+    settled = {"library.folder": str(tmp_path), "server.listen": nobody, "discovery.enabled": False}
+    told = {finding.check: finding for finding in doctor.examine(None, settled)}["server"]
+    assert (told.state, told.found) == (
+        "warning", f"process {os.getpid()} works in the library, and no node answers at {nobody}",
+    )  # fmt: skip
+    library.close()
+
+
+@pytest.mark.parametrize("seen", ["", None])
+def test_where_locks_cannot_be_seen_a_node_is_believed(
+    seen: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Library(tmp_path / "ours").close()
+    if seen is not None:
+        (tmp_path / "locks").write_text(seen)
+    monkeypatch.setattr(library_folder, "LOCKS", tmp_path / "locks")
+    assert library_folder.holder_of(tmp_path / "ours") is None
+    assert states(doctor.check_server(server(7345), "node", None)) == ["ok"]
+
+
 def test_a_program_that_says_nothing_is_another_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "ANSWER_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -265,9 +309,12 @@ def test_discovery_says_what_it_is_worth(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(doctor, "is_heard", is_heard)
     assert states(doctor.check_discovery(config(tmp_path), False)) == ["warning"]  # on loopback
+    assert states(doctor.check_discovery(config(tmp_path), True)) == ["warning"]
+    assert not any(tmp_path.iterdir()), "a doctor changes nothing"
+    known = node_identity(tmp_path)
     unheard = doctor.check_discovery(config(tmp_path), True)
     assert unheard.state == "problem" and "5353" in unheard.cure
-    assert asked == [None, (tmp_path / "node-id").read_text()]
+    assert asked == [None, None, known]
 
 
 def test_no_network_is_a_problem_of_discovery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
