@@ -137,7 +137,7 @@ class Turntable:
         schedule, position = self._schedule, self._position
         rate = self._rate_at(position)
         reach = min(position + rate * dt_s, self._goal)
-        end = int(np.searchsorted(schedule.counts, reach, "right"))
+        end = int(schedule.counts.searchsorted(math.floor(reach), "right"))
         if end > self._next + room:
             end = self._next + room
             reach = max(position, float(schedule.counts[end - 1])) if end else position

@@ -1,9 +1,9 @@
 """`bench capture`: what a sweep costs the node, and whether looking clients cost the sweep anything.
 
-Scanner, node, clients and driver are processes of their own. USB is emulated under umockdev's preload, whose work
-counts as the node's; only that it sleeps for 0 s at every ioctl, which the kernel takes for its timer's slack of 50 us
-and which no real USB does, is taken out. Durations are the scanner's own: from the first column to the last. Compared
-are sweeps of one run, taken in turn; a figure is a median.
+Scanner, node, clients and driver are processes of their own, and so is the emulated USB, which is neither's. What it
+does inside the node, as umockdev's preload, counts as the node's; only that it sleeps for 0 s at every ioctl, which the
+kernel takes for its timer's slack of 50 us and which no real USB does, is taken out. Durations are the scanner's own:
+from the first column to the last. Compared are sweeps of one run, taken in turn; a figure is a median.
 
 Processor time tells more than the clock on a machine that others use, too: it is given as a share of a core, of the
 node and of the scanner's process each, and for the node also as the share that the full speed of the link would take.

@@ -3,6 +3,8 @@
     device LINK PATH SIZE BYTES_S TURN_S PORTION
                                             a simulated scanner; prints a line for each sweep: seconds, columns' bytes,
                                             processor time, how long the node kept it waiting
+    bus PATH CABLE                          the emulated USB that a device is plugged into, CABLE the number of an open
+                                            socket; prints the device's address and what a node's environment needs
     look URL CLIENTS                        clients that look as fast as they can, until SIGTERM; prints their updates
     read ADDRESS BYTES                      the USB driver alone, under umockdev's preload; prints seconds and CPU
     assemble [LATERAL RADIAL LEAN SIDE]     a grid of L from its columns, corrected for an axis that is there; prints
@@ -15,23 +17,100 @@ import asyncio
 import json
 import os
 import random
+import select
 import signal
+import socket
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+PORTION_BYTES_MAX = 1 << 19
+FOR_EVER_S = 3600.0
 NICE = 19  # clients stand for other machines: they may have what is left of this one
 
 
 def say(**record: Any) -> None:
     """One line for whoever started this."""
     print(json.dumps(record), flush=True)
+
+
+class Cable:
+    """A scanner's end of a cable to a bus in a process of its own, as a carrier's port: the two share no interpreter,
+    as a scanner shares none with the USB that it is plugged into.
+
+    rate_bytes_s : speed towards the node.  waited_s : for the node to fetch what was sent.
+    """
+
+    def __init__(self, path: str, rate_bytes_s: float) -> None:
+        from simulators.pace import Pace
+
+        self.waited_s = 0.0
+        self._pace = Pace(rate_bytes_s)
+        self._end, far_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)  # what is written stays one piece
+        self._end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, PORTION_BYTES_MAX)
+        command = [sys.executable, "-m", "tests.bench.capture_worker", "bus", path, str(far_end.fileno())]
+        with far_end:
+            self._bus = subprocess.Popen(command, pass_fds=[far_end.fileno()])
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """What the node wrote."""
+        ready, _, _ = select.select([self._end], [], [], timeout_s)
+        return self._end.recv(max_bytes) if ready else b""
+
+    def write(self, data: bytes) -> None:
+        """Send `data` as one piece, at the pace of the line. Raises BrokenPipeError once the cable is cut."""
+        if not data:
+            return
+        try:
+            self._end.send(data, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            began_s = time.monotonic()
+            self._end.send(data)
+            self.waited_s += time.monotonic() - began_s
+        self._pace.wait(len(data))
+
+    def hang_up(self) -> None:
+        """Pull the plug. This one has no faults."""
+        raise NotImplementedError
+
+    def plug_in(self) -> None:
+        """Put it in again."""
+        raise NotImplementedError
+
+    def cancel(self) -> None:
+        """Cut it: whoever reads or writes wakes."""
+        self._end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Unplug for good."""
+        self._bus.terminate()
+        self._bus.wait()
+        self._end.close()
+
+
+def bus(path: str, cable: str) -> None:
+    """Carry what comes by a cable to whoever reads the emulated USB, and back, until the cable is cut."""
+    from simulators.usb_testbed import UsbTestbed
+
+    def back() -> None:
+        while True:
+            if data := bed.read(PORTION_BYTES_MAX, FOR_EVER_S):
+                end.send(data)
+
+    portion = memoryview(bytearray(PORTION_BYTES_MAX))
+
+    with socket.socket(fileno=int(cable)) as end, closing(UsbTestbed(Path(path))) as bed:
+        say(address=bed.name, environment=bed.environment)
+        threading.Thread(target=back, daemon=True).start()
+        while size := end.recv_into(portion):
+            bed.write(bytes(portion[:size]))
 
 
 def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str, portion: str) -> None:
@@ -43,7 +122,6 @@ def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str, port
     from simulators.scanner import SimulatedScanner
     from simulators.specimen import make_specimen
     from simulators.turntable import Turntable
-    from simulators.usb_testbed import BUS_SWITCH_S, UsbTestbed
 
     class Timed(SimulatedScanner):
         _began: tuple[float, float, int, float] | None = None
@@ -53,7 +131,7 @@ def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str, port
         def data_to_send(self, max_bytes: int) -> bytes:
             data = super().data_to_send(max_bytes)
             now_s = time.monotonic()
-            waited_s = port.waited_s if isinstance(port, UsbTestbed) else 0.0
+            waited_s = port.waited_s if isinstance(port, Cable) else 0.0
             if self.state is State.SWEEPING and self._began is None:
                 self._began = now_s, time.process_time(), self._link.sent_bytes, waited_s
                 self._stood_s = 0.0
@@ -67,25 +145,23 @@ def device(link: str, path: str, size: str, rate_bytes_s: str, turn_s: str, port
             self._stands_since_s = now_s if self._is_starved() else None
             return data
 
-    sys.setswitchinterval(BUS_SWITCH_S)
     is_usb = link == "usb"
     table = Turntable(make_specimen("head", size), turn_s=float(turn_s))
     scanner = Timed(table, payload_max=USB_PAYLOAD_MAX if is_usb else SERIAL_PAYLOAD_MAX)
     stop = threading.Event()
-    port: UsbTestbed | PtyPort
+    port: Cable | PtyPort
     if is_usb:
-        port = UsbTestbed(Path(path), rate_bytes_s=float(rate_bytes_s))
+        port = Cable(path, float(rate_bytes_s))
     else:
         port = PtyPort(Path(path), BITS_PER_BYTE * round(float(rate_bytes_s)))
+        say(address=port.name, environment={})
 
     def end(*_: object) -> None:
         stop.set()
         port.cancel()
 
     signal.signal(signal.SIGTERM, end)
-    with closing(port):
-        environment = port.environment if isinstance(port, UsbTestbed) else {}
-        say(address=port.name, environment=environment)
+    with closing(port), suppress(BrokenPipeError):
         serve(scanner, port, stop, int(portion))
 
 
@@ -183,7 +259,7 @@ def _peak_bytes() -> int:
     return 1024 * int(status.split("VmHWM:")[1].split()[0])
 
 
-JOBS: dict[str, Callable[..., None]] = {"device": device, "look": look, "read": read, "assemble": assemble}
+JOBS: dict[str, Callable[..., None]] = {"device": device, "bus": bus, "look": look, "read": read, "assemble": assemble}
 
 if __name__ == "__main__":
     JOBS[sys.argv[1]](*sys.argv[2:])
