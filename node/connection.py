@@ -354,19 +354,18 @@ class Connection:
         ahead = Ahead(superseded)
 
         def job() -> AnyUpdate:
-            if hurried:
-                planned = self._exhibits.planners.plan(
-                    bound, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried
-                )
-                if planned is not None:
-                    return planned
             update = bound.plan(
                 look, self._codecs, budget, ahead.superseded, models[0], quick, models[1], hurried, pool,
                 None if pool is None else ahead.send,
             )  # fmt: skip
             return update.settled() if pool is None and isinstance(update, Update) else update
 
-        planning = asyncio.ensure_future(self._exhibits.work(job, "look"))
+        def elsewhere() -> AnyUpdate | None:
+            return self._exhibits.planners.plan(
+                bound, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried
+            )
+
+        planning = asyncio.ensure_future(self._exhibits.work(job, "look", None if pool else elsewhere))
         try:
             either: set[asyncio.Future[Any]] = {planning, ahead.first}
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)

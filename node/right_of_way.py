@@ -1,8 +1,8 @@
-"""A sweep on a fast line goes first: what is computed for clients waits while columns come.
+"""A sweep on a fast line goes first: what threads compute for clients waits while columns come.
 
 All threads share one interpreter. Columns at the full speed of USB need it a hundred times between two moments at which
-a thread that plans an update would let go of it, so while they come, updates are made one at a time, with pauses in
-which the capture thread makes good what it was kept from. On a serial line nothing ever waits.
+a thread that computes would let go of it, so while they come, that is done one at a time, with pauses in which the
+capture thread makes good what it was kept from. On a serial line nothing ever waits, nor what a process plans.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Whose turn it is to plan, and when that presses."""
 
 import asyncio
+import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, closing
 from pathlib import Path
@@ -80,6 +81,21 @@ async def test_who_gives_up_waiting_is_not_waited_for(exhibits: Exhibits) -> Non
         assert all(isinstance(end, asyncio.CancelledError) for end in ends)
     async with exhibits.turn() as is_pressing:
         assert not is_pressing
+
+
+async def test_what_a_process_does_waits_for_no_columns_and_what_it_does_not_is_done_here_when_they_let(
+    exhibits: Exhibits,
+) -> None:
+    exhibits._way._taken_until_s = time.monotonic() + 60  # columns come fast
+
+    def here() -> str:
+        return f"here, in turn: {exhibits._way._one.locked()}"
+
+    def there() -> str:
+        return f"there, in turn: {exhibits._way._one.locked()}"
+
+    assert await exhibits.work(here, "look", there) == "there, in turn: False"
+    assert await exhibits.work(here, "look", lambda: None) == "here, in turn: True"
 
 
 @pytest.mark.parametrize("profile", ["default", "classic"])
