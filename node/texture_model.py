@@ -9,7 +9,6 @@ update that is sent. Of a sphere the rows' own texels are coded, zone by zone of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
@@ -38,6 +37,10 @@ QUALITIES = {
     TextureCodec.HTJ2K: (6, 20, 34, 48, 62),
     TextureCodec.JPEG: (JPEG_QUALITY_MIN, 22, 32, 43, JPEG_QUALITY_MAX),
 }
+POLAR_QUALITIES = {  # what is interpolated between two is off by 0.4 dB; maps are coded so quickly that there are more
+    TextureCodec.HTJ2K: (6, 20, 34, 37, 40, 44, 48, 62),
+    TextureCodec.JPEG: QUALITIES[TextureCodec.JPEG],
+}
 SPACINGS = (8, 4, 2, 1)
 CELL = 16
 TILE_SIDES = 64, 256  # texels: a window that people look at has some of them
@@ -51,7 +54,7 @@ LOG_BYTES_SLOPE = 0.07
 BIAS_WEIGHT = 0.3
 WEIGHT_MIN = 0.1  # of a cell that keeps no detail, in doublings of error
 COMPARED_EVERY = 4  # of a map's texels, along and across
-DISC_SHARE = math.pi / 4  # of a map, on which the texture's blocks lie
+DISC_SHARE = 0.9  # of a map's bytes: pi / 4, where the texture's blocks lie, and the edges that windows have
 STRETCHED = 4  # steps of quality by which the quantiser acts finer on texels twice as dense along one axis
 
 
@@ -123,8 +126,10 @@ class _Measured:
     mse : squared error per value.  content : bytes, but for what every image takes.  constant : that.
     """
 
-    def __init__(self, codec: TextureCodec, p: int, cells: tuple[int, int]) -> None:
-        self.codec, self.p, self.qualities = codec, p, QUALITIES[codec]
+    def __init__(
+        self, codec: TextureCodec, p: int, cells: tuple[int, int], qualities: tuple[int, ...] | None = None
+    ) -> None:
+        self.codec, self.p, self.qualities = codec, p, qualities or QUALITIES[codec]
         self.mse = np.empty((len(self.qualities), *cells), np.float32)
         self.content = np.empty((len(self.qualities), *cells), np.float32)
         self.constant = np.zeros(len(self.qualities))
@@ -289,23 +294,28 @@ def _survey_maps(
 ) -> _Measured:
     """What images of the poles take and miss: their maps are coded whole, and some texels held against them.
 
-    What a map takes is spread over its blocks as what their strips take.
+    What a map takes is spread over its blocks by how large each is on it and how much detail it keeps.
     """
     codec, p = of_strips.codec, of_strips.p
-    measured = _Measured(codec, p, of_strips.mse.shape[1:])
-    measured.mse[:], measured.content[:], measured.constant[:] = of_strips.mse, of_strips.content, of_strips.constant
+    measured = _Measured(codec, p, of_strips.mse.shape[1:], POLAR_QUALITIES[codec])
+    nearest = [int(np.argmin(np.abs(np.subtract(of_strips.qualities, quality)))) for quality in measured.qualities]
+    measured.mse[:], measured.content[:] = of_strips.mse[nearest], of_strips.content[nearest]
+    measured.constant[:] = of_strips.constant[nearest]
     columns = np.arange(COMPARED_EVERY // 2, texture.shape[1], COMPARED_EVERY)
     for place, image, on_it in maps.halves(p):
         rows = np.arange(on_it.start * CELL + COMPARED_EVERY // 2, on_it.stop * CELL, COMPARED_EVERY)
         truth = np.ascontiguousarray(texture[rows][:, columns])
+        detail = _cell_errors(truth, np.asarray(cv2.blur(truth, (9, 9)), np.uint8), CELL // COMPARED_EVERY)
+        area = np.sin(np.pi * CELL * (np.arange(on_it.start, on_it.stop) + 0.5) / texture.shape[0])[:, None]
         for index, quality in enumerate(measured.qualities):
             if unwanted():
                 raise CancelledError
             payload = encode_texture(image, codec, quality)
             seen = place.texels_at(rows, columns, decode_texture(payload, codec, quality, place.sample_shape))
-            measured.mse[index, on_it] = _cell_errors(truth, seen, CELL // COMPARED_EVERY)
-            content = measured.content[index, on_it]
-            content *= max(DISC_SHARE * (len(payload) - measured.constant[index]), 1.0) / float(content.sum())
+            missed = _cell_errors(truth, seen, CELL // COMPARED_EVERY)
+            weight = area * _weights(detail, missed)
+            taken = max(DISC_SHARE * (len(payload) - measured.constant[index]), 1.0)
+            measured.mse[index, on_it], measured.content[index, on_it] = missed, weight * (taken / weight.sum())
     return measured
 
 
@@ -325,13 +335,18 @@ def _survey(measured: _Measured, texture: ImageArray, unwanted: Callable[[], boo
             decoded = decode_texture(payload, measured.codec, quality, (sampled.shape[0], sampled.shape[1]))
             measured.mse[(index, *cells)] = _cell_errors(tile, _spread(decoded, p, tile))
             missed = _cell_errors(sampled, decoded, CELL // p)
-            kept = np.log2(np.maximum(detail, MSE_MIN) / np.maximum(missed, MSE_MIN))
-            measured.content[(index, *cells)] = np.maximum(kept, 0) + WEIGHT_MIN
+            measured.content[(index, *cells)] = _weights(detail, missed)
             sizes[index] = len(payload)
     measured.constant[:] = _constant_bytes(measured, texture, taken, side)
     for (top, left), sizes in taken.items():
         weight = measured.content[:, *_cells_at(top, left, _tile(texture, top, left, side))]
         weight *= (np.maximum(sizes - measured.constant, 1.0) / weight.sum(axis=(1, 2)))[:, None, None]
+
+
+def _weights(detail: NDArray[np.float32], missed: NDArray[np.float32]) -> NDArray[np.float32]:
+    """How much of the bytes each cell accounts for, by the detail that it has and what is missed."""
+    kept = np.log2(np.maximum(detail, MSE_MIN) / np.maximum(missed, MSE_MIN))
+    return np.asarray(np.maximum(kept, 0) + WEIGHT_MIN, np.float32)
 
 
 def _constant_bytes(

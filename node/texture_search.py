@@ -45,7 +45,7 @@ from protocol.strips import Strips
 SKIRT_S = 1.0
 GRAINS = {"htj2k": 1 / SIXTEENTHS, "jpeg": 1.0}  # by how much qualities of a codec can differ
 FINEST_SHARE = 1.03  # of what another spacing takes: up to there spacing 1 is preferred
-POLAR_SHARE = 0.92  # and up to there one image of a pole: a quarter of the texels of strips at spacing 1
+POLAR_SHARE = 0.88  # and up to there one image of a pole at spacing 2: a quarter of the texels of strips at spacing 1
 POOR = (1, 2, 4, 16)  # times the error allowed: blocks that are held no better may be sent again
 FAR = 16  # steps of quality above the first guess, from where a closer spacing serves better
 SPOILT_SHARE = 0.6  # of the error allowed: blocks that stay may take so much of what those that are sent may have
@@ -227,8 +227,9 @@ class TextureSearch:
             return min(choices, key=lambda choice: choice.mse, default=None)
 
         def cost(choice: _Choice) -> float:
-            share = POLAR_SHARE if self._is_polar(choice.p) else 1 if choice.p == 1 else FINEST_SHARE
-            return choice.size_bytes * share
+            if self._is_polar(choice.p) and choice.p == POLAR_SPACINGS[0]:
+                return choice.size_bytes * POLAR_SHARE
+            return choice.size_bytes * (1 if choice.p == 1 else FINEST_SHARE)
 
         return min(reaching, key=cost)
 
