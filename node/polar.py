@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from node.sample import smoothed
-from protocol.grid import TEXTURE_BLOCK, ImageArray
+from protocol.grid import TEXTURE_BLOCK, ImageArray, IntArray
 from protocol.lattice import ChannelShape
 from protocol.polar import PolarImage, PolarMap
+from protocol.reconstruct import Selection
 from protocol.region import Region
 from protocol.strips import Strips, blocks_of
 
 SPACINGS = (2, 4)
 FARTHEST_RAD = 1.3  # from a pole: there a sample is 0.8 of its spacing high and 1.25 wide
 BAND_ROWS = 256
+NARROW = 4.0  # samples
 MARGIN = 4  # samples that images reach further than their blocks, at most
 BlockArray = NDArray[np.int32]
 
@@ -96,13 +98,28 @@ class _MapPart:
         columns = slice(image.left - self.left, image.left - self.left + image.columns)
         adopted = np.zeros(math.prod(strips[0].selection.lattice.shape.blocks), np.uint8)
         adopted[blocks_of(strips)] = 1
-        seen = cv2.dilate(adopted[self.block[rows, columns]], np.ones((3, 3), np.uint8)).astype(np.bool_)
-        return smoothed(self.texels[rows, columns], seen)
+        within = adopted[self.block[rows, columns]]
+        for strip in strips:
+            within[_narrow_places(strip.selection, image)] = 1
+        return smoothed(self.texels[rows, columns], cv2.dilate(within, np.ones((3, 3), np.uint8)).astype(np.bool_))
 
 
 def _reach(height: int) -> float:
     """How many rows of a texture lie on a map."""
     return FARTHEST_RAD / math.pi * height
+
+
+def _narrow_places(selection: Selection, image: PolarImage) -> tuple[IntArray, IntArray]:
+    """Rows and columns of an image where texels of blocks lie that may hold no sample: narrow ones, and at the pole."""
+    place, block = image.place, selection.y.block
+    top = block * TEXTURE_BLOCK
+    ends = place.radius(top), place.radius(top + selection.y.size - 1)
+    wide = selection.adopted.sum(axis=1) * np.maximum(*ends) * (2 * np.pi * TEXTURE_BLOCK / place.width)
+    some, columns = np.nonzero(selection.adopted & (np.minimum(wide, np.minimum(*ends)) < NARROW)[:, None])
+    row = (top[some][:, None] + np.arange(TEXTURE_BLOCK)).clip(max=place.height - 1)
+    radius, angle = place.radius(row), place.angle(selection.x.block[columns] * TEXTURE_BLOCK + TEXTURE_BLOCK // 2)
+    x, y = radius * np.cos(angle)[:, None] - image.left, radius * np.sin(angle)[:, None] - image.top
+    return y.ravel().astype(np.int64), x.ravel().astype(np.int64)
 
 
 def _maps_of(texture: ImageArray) -> Iterator[tuple[PolarMap, _MapPart]]:

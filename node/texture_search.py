@@ -237,8 +237,9 @@ class TextureSearch:
         if self._model is None:
             found = choose_spacing(self._scan, self._state, self._region, self._look.texture_db, self._codec)
             return (int(found),)
-        turn, wide = self._state.shapes[Channel.TEXTURE].blocks[1], self._region.blocks(TEXTURE_BLOCK)[2]
-        return tuple(p for p in SPACINGS if wide < turn or self._region.turn % p == 0)
+        shape, wide = self._state.shapes[Channel.TEXTURE], self._region.blocks(TEXTURE_BLOCK)[2]
+        finer = (p for p in SPACINGS if p * p < 1 << shape.coarse_level)  # than the first view: else nobody adopts it
+        return tuple(p for p in finer if wide < shape.blocks[1] or self._region.turn % p == 0)
 
     def _offer(self, p: int, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
         """What a spacing can do for so many bytes of payload; None where it fits at no quality."""
