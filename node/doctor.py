@@ -151,8 +151,9 @@ def check_port(port: str | None, *, is_used: bool = False) -> Finding:
 
 def _no_port(found: str) -> Finding:
     there = ", ".join([*serial_ports(), *(port.address for port in find_ports() if port.address.startswith("usb:"))])
-    cure = f"plug the scanner in and switch it on, or correct its address; ports here: {there or 'none'}"
-    return Finding("port", "problem", found, cure)
+    found, _, cure = found.partition("; ")  # what the port itself advises, where it does
+    cure = cure or "plug the scanner in and switch it on, or correct its address"
+    return Finding("port", "problem", found, f"{cure}; ports here: {there or 'none'}")
 
 
 def _looked_up(address: str, is_used: bool) -> Finding:

@@ -204,6 +204,7 @@ def run_backup(args: argparse.Namespace) -> int:
 
 def run_restore(args: argparse.Namespace) -> int:
     """Take a backup in."""
+    args.file.open("rb").close()  # before a library is made for what cannot be read
     with _opened(_set_folder(args)) as library:
         restored = library.restore(args.file)
     note_at_console(_config(args), "restored", restored.added)

@@ -85,6 +85,8 @@ def test_a_port_that_another_program_uses_is_a_problem_unless_it_is_the_node(por
         busy = doctor.check_port(port)
         assert (busy.state, port in busy.cure) == ("problem", True)
         assert states(doctor.check_port(port, is_used=True)) == ["ok"]
+        (told,) = doctor.examine_scanner(port, None, {})
+        assert told.found.endswith("another program has it open") and told.cure.startswith("end that")
 
 
 @pytest.mark.parametrize("address", ["usb:1209:5ca1:NONE", "serial:1209:5ca1:NONE", "usb:nonsense"])

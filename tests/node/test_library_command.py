@@ -88,6 +88,8 @@ def test_list_works_while_a_node_runs_and_rename_does_not(folder: Path) -> None:
 def test_a_library_that_is_not_there_is_not_made_by_looking(tmp_path: Path) -> None:
     with pytest.raises(LibraryError, match="No such file"):
         run("list", "--library", tmp_path / "none")
+    with pytest.raises(OSError, match="No such file"):
+        run("restore", tmp_path / "none.tar", "--library", tmp_path / "none")
     assert list(tmp_path.iterdir()) == []
 
 
