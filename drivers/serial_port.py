@@ -21,8 +21,10 @@ from drivers.self_pipe import SelfPipe
 from protocol.errors import PortLost
 
 _WRITE_TIMEOUT_S = 2.0
-_GATHER_S = 0.008  # bytes that follow within this time are read at once: fewer wake-ups; at 3 Mbaud that is 2.4 KB
-_GATHER_BELOW_BYTES = 1024  # the kernel's own buffer holds 4 KiB
+_GATHER_S = 0.015  # bytes that follow within this time are read at once: a wake-up costs more than what it brings
+_GATHER_BYTES = 4500  # but no more than these; a kernel's buffers, with those of a USB adapter, hold 12 KB at least
+_GATHER_BELOW_BYTES = 4000  # a read brings 4 KiB at most: more is waiting, perhaps
+_BITS_PER_BYTE = 10  # start, eight data, stop
 _GONE = (OSError, termios.error, TypeError, ValueError)  # pyserial's SerialException is an OSError
 _CURES = {
     errno.EACCES: "permission denied; join the group that owns it (foveascan doctor names it)",
@@ -44,6 +46,7 @@ class SerialPort:
             self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
         except _GONE as error:
             raise PortLost(f"{path}: cannot open: {_why(error)}") from error
+        self._gather_s = min(_GATHER_S, _GATHER_BYTES * _BITS_PER_BYTE / baud)
         self._waiting = SelfPipe(self._serial.fileno())
         self._room = select.poll()
         self._room.register(self._serial.fileno(), select.POLLOUT)
@@ -59,7 +62,7 @@ class SerialPort:
             if not self._waiting.wait(timeout_s):
                 return b""
             if self._serial.in_waiting < _GATHER_BELOW_BYTES:
-                time.sleep(_GATHER_S)
+                time.sleep(self._gather_s)
             data = os.read(self._serial.fileno(), max_bytes)
             if not data:
                 raise ConnectionResetError("the line is ready and empty: it has ended")
