@@ -10,6 +10,7 @@ from node.coded import Coded
 from node.texture_model import MSE_MIN, Expected
 
 MARGIN = 0.98  # of the squared error allowed: what is aimed at
+MARGIN_CYLINDER = 0.99  # the same where errors are not weighed by area, and so are what anybody measures
 OVERSHOOT_DB = 0.45  # a result so little above the target is not worth another encode: a step of quality is 0.35 dB
 FILL = 0.88  # of the bytes aimed at: range takes what is left, so only less than this is worth one more encode
 HIGHER = 0.5  # by how much a quality is raised at least that was expected to do and did not
@@ -50,7 +51,7 @@ class QualitySearch:
 
     aim_bytes, limit_bytes : payload to aim at, and the most it may be.
     expected : what qualities take and reach, by the scan's model.  lowest, highest : the codec's qualities.
-    grain : by how much these can differ.
+    grain : by how much these can differ.  margin : of target_mse, what is aimed at.
     """
 
     def __init__(
@@ -63,8 +64,9 @@ class QualitySearch:
         highest: int,
         tries: int = TRIES,
         grain: float = 1.0,
+        margin: float = MARGIN,
     ) -> None:
-        self._tries = tries
+        self._tries, self._margin = tries, margin
         self._target = target_mse
         self._aim_bytes, self._limit = aim_bytes, limit_bytes
         self._expected = expected
@@ -136,7 +138,7 @@ class QualitySearch:
 
     def _aim(self, worse: float, larger: float) -> None:
         """Choose the next quality, given how far the expectation was off: factors on squared error and bytes."""
-        wanted = ceiled(self._expected.quality_for_mse(MARGIN * self._target / worse), self._grain)
+        wanted = ceiled(self._expected.quality_for_mse(self._margin * self._target / worse), self._grain)
         affordable = wanted
         if math.isfinite(self._aim_bytes):
             affordable = floored(self._expected.quality_for_bytes(self._aim_bytes / larger), self._grain)

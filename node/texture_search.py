@@ -20,7 +20,7 @@ from node.held_texture import HELD_MARGIN, HeldTexture
 from node.library import Scan
 from node.polar import SPACINGS as POLAR_SPACINGS
 from node.polar import PolarTexture, reaches
-from node.quality import MARGIN, TRIES, Encodes, Point, QualitySearch, ceiled, floored
+from node.quality import MARGIN, MARGIN_CYLINDER, TRIES, Encodes, Point, QualitySearch, ceiled, floored
 from node.refine_texture import (
     CODECS,
     Compared,
@@ -88,6 +88,8 @@ class TextureSearch:
         self._quick, self._encodes = quick, encodes
         self._tries = 1 if hurried else TRIES
         self._target_mse = mse_of_db(look.texture_db)
+        self._margin = MARGIN_CYLINDER if scan.spec.geometry == "cylinder" else MARGIN
+        self._aim_mse = self._margin * self._target_mse
         self._lowest, self._highest = quality_bounds(codec)
         self._grain = GRAINS[codec]
         self._places: dict[int, Place] = {}
@@ -191,7 +193,7 @@ class TextureSearch:
         for begin, stop in pairwise([*(jumps or [self._lowest]), LOSSLESS]):
             sent = among & (needed <= begin)
             expected, self._least[p, listed] = self._expect_sent(p, sent if sent.any() else among), begin
-            if expected.quality_for_mse(MARGIN * self._target_mse) < stop:
+            if expected.quality_for_mse(self._aim_mse) < stop:
                 break
         return expected
 
@@ -244,7 +246,7 @@ class TextureSearch:
     def _offer(self, p: int, aim_bytes: float, listed: tuple[int, ...] | None) -> _Choice | None:
         """What a spacing can do for so many bytes of payload; None where it fits at no quality."""
         expected = self._expected(p, listed)
-        wanted = max(ceiled(expected.quality_for_mse(MARGIN * self._target_mse), self._grain), self._least[p, listed])
+        wanted = max(ceiled(expected.quality_for_mse(self._aim_mse), self._grain), self._least[p, listed])
         quality = min(wanted, self._highest)
         if math.isfinite(aim_bytes):
             quality = min(quality, floored(expected.quality_for_bytes(aim_bytes), self._grain))
@@ -264,10 +266,12 @@ class TextureSearch:
         while p in SPACINGS:
             expected, highest = self._expected(p, listed), self._highest
             if p > 1:
-                highest = min(highest, math.ceil(expected.quality_for_mse(MARGIN * self._target_mse)) + FAR)
+                highest = min(highest, math.ceil(expected.quality_for_mse(self._aim_mse)) + FAR)
             bounds = aim_bytes - OVERHEAD_BYTES, limit_bytes - OVERHEAD_BYTES
             lowest = self._least[p, listed] if math.isinf(limit_bytes) else self._lowest
-            search = QualitySearch(self._target_mse, *bounds, expected, lowest, highest, self._tries, self._grain)
+            search = QualitySearch(
+                self._target_mse, *bounds, expected, lowest, highest, self._tries, self._grain, self._margin
+            )
             if not self._try_qualities(search, p, listed):
                 return None
             self.limited |= search.limited
@@ -367,15 +371,16 @@ class TextureSearch:
         return self._held.touched & ~self._held.left_alone(coded)
 
     def _learn(self, p: int, coded: Coded, mse: float | None = None) -> None:
-        """Tell the model what a refinement took, where a skirt is not what took it.   mse : what the window then has.
+        """Tell the model what a refinement took, and missed, where a skirt is not what took it.
 
-        What images of a pole miss it learns, too: their maps were measured whole, not by tiles.
+        mse : what the window then has. It is expected of tiles, which miss a little less than one image or a pole's.
         """
         if self._model is None or self._look.alpha is not None:
             return
         sent, polar = self._sent(coded), self._is_polar(p)
         expected, worse = self._place(p).expect(sent), 1.0
-        if polar and mse is not None and bool((sent == self._held.touched).all()):
+        is_whole = polar or self._scan.spec.geometry == "cylinder"
+        if is_whole and mse is not None and bool((sent == self._held.touched).all()):
             worse = mse / expected.mse(coded.quality)
         taken = expected.size_bytes(coded.quality), len(coded.payload)
         self._model.learn(CODECS[self._codec], p, *taken, polar=polar, worse=worse)

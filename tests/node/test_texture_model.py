@@ -81,6 +81,19 @@ def test_bytes_are_learned_from_what_is_sent() -> None:
     assert model.expect(region, TextureCodec.JPEG).size_bytes(40) == pytest.approx(1.3 * before, rel=0.03)
 
 
+def test_what_is_missed_is_learned_too() -> None:
+    model = TextureModel(TEXTURE[:256, :256])
+    region = region_round(0.5, 0.5, 1.0, 256, 256)
+    before = model.expect(region, TextureCodec.HTJ2K).mse(40)
+    for _ in range(20):
+        worse = 1.2 * before / model.expect(region, TextureCodec.HTJ2K).mse(40)
+        model.learn(TextureCodec.HTJ2K, 1, 100, 100, worse=worse)
+    assert model.expect(region, TextureCodec.HTJ2K).mse(40) == pytest.approx(1.2 * before, rel=0.02)
+    assert model.expect(region, TextureCodec.HTJ2K, 2).mse(40) == TextureModel(TEXTURE[:256, :256]).expect(
+        region, TextureCodec.HTJ2K, 2
+    ).mse(40)
+
+
 def test_generic_expectation_puts_the_target_in_the_middle() -> None:
     expected = Expected.generic(mse_of_db(40), 5000)
     quality = expected.quality_for_mse(mse_of_db(40))
