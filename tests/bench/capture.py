@@ -146,12 +146,14 @@ def sweep(running: Line, window_s: float = WINDOW_S) -> dict[str, Any]:
 async def _sweep(running: Line, window_s: float) -> tuple[float, int]:
     """The node's share of a core while columns came, and how many it had to ask for again."""
     from client import connect
+    from tests.bench.ours import surveyed
 
     async with connect(running.url) as session:
         published = session.published()
         while (await session.scanner())["phase"] != "ready":
             await asyncio.sleep(POLL_S)
-        await asyncio.sleep(SETTLED_S)  # the node looks a new scan over
+        await surveyed(running.url)  # what the node does with the scan before is no part of this sweep
+        await asyncio.sleep(SETTLED_S)
         await session.start_sweep()
         await asyncio.sleep(BEGIN_S)
         first = time.monotonic(), _cpu_s(running.pid)

@@ -53,11 +53,11 @@ async def node_at(scans: Iterable[BenchScan]) -> AsyncIterator[tuple[str, int, S
             async with connect(ready["url"]) as session:
                 for scan_id in ids.values():
                     await session.open(scan_id)
-                await _surveyed(ready["url"])
+                await surveyed(ready["url"])
                 yield ready["url"], program.pid, session, ids
 
 
-async def _surveyed(url: str) -> None:
+async def surveyed(url: str) -> None:
     """Wait until the node has measured the textures of what is open: figures are of a node at rest."""
     async with aiohttp.ClientSession() as http:
         while True:
