@@ -18,7 +18,7 @@ from node.capture import Manner
 from node.daemon import start_node
 from node.journal import Journals
 from node.library import content_id
-from node.resume import publish_complete
+from node.resume import cut_lately, publish_complete
 from node.running_sweep import RunningSweep
 from protocol.errors import LibraryError, PortLost
 from protocol.grid import Grid
@@ -94,6 +94,14 @@ def test_a_scanner_that_is_not_the_same_is_refused(plug: Plug, node: Node, kinds
     assert (after.held, after.is_complete) == (before.held, False)
     assert node.capture.request_sweep()
     assert is_truth(node.grids.get(timeout=WAIT_S))
+
+
+def test_a_sweep_goes_on_by_itself_within_half_a_minute_and_no_later(plug: Plug, node: Node) -> None:
+    sweep = node.sweeps.get(cut(plug, node, device(boot_id=2)))
+    for later_s, goes_on in ((0.0, True), (29.0, True), (31.0, False), (-1.0, False)):
+        found = cut_lately([sweep], sweep.info, sweep.ended_unix_s + later_s)
+        assert (found is not None) == goes_on, later_s
+    assert cut_lately([sweep], replace(sweep.info, boot_id=2), sweep.ended_unix_s) is None
 
 
 def test_an_unknown_sweep_cannot_be_resumed(plug: Plug, node: Node) -> None:

@@ -127,6 +127,7 @@ def test_the_command_says_what_would_go_and_deletes_it(tmp_path: Path, capsys: p
 
 @pytest.fixture
 async def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Entrance]:
+    assert serve.RETAIN_S == 600, "README says every ten minutes"
     monkeypatch.setattr(serve, "RETAIN_S", 0.05)
     async with entrance(tmp_path / "library", retention=MONTH) as node:
         yield node
