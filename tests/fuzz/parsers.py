@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import io
+import math
 import shutil
 import zipfile
 import zlib
@@ -42,7 +43,8 @@ from protocol.codec import (
 from protocol.errors import FoveascanError
 from protocol.framing import FrameReader, encode_frame
 from protocol.grid import StepArray
-from protocol.lattice import Channel
+from protocol.holdings import ChannelHoldings, texture_rank
+from protocol.lattice import Channel, Parameters
 from protocol.live import LiveColumns, is_live
 from protocol.refinement import CRC, Generator, Refinement
 from protocol.scanner_link import Role, ScannerLink
@@ -59,6 +61,7 @@ from protocol.session import Role as End
 from protocol.session import Session
 from protocol.sphere_fovea import Kind
 from protocol.sphere_fovea import SphereParameters as ClassicSphere
+from protocol.strips import build_strips, image_shapes, select_strips
 from tests.client.scripted_node import Planner, synthetic_grid
 from tests.client.test_classic_model import INFO as CLASSIC
 from tests.client.test_classic_model import first_view, range_fovea, texture_fovea
@@ -157,7 +160,7 @@ def _of_the_stream() -> Iterable[Target]:
     classic = (*first_view(), range_fovea(), texture_fovea())
     yield Target("classic-model", tuple(one.to_bytes() for one in classic), _ModelOf(CLASSIC, classic[:2]))
     strips = tuple(bytes.fromhex(step["refinement"]) for step in STEPS if step["refinement"])
-    yield Target("sphere-model", strips, _ModelOf(*_sphere()))
+    yield Target("sphere-model", (*strips, _round_a_pole().to_bytes()), _ModelOf(*_sphere()))
     classic_sphere = ClassicSphere(1, Kind.RINGS, 1 << 30, 0, 0.5, 0.1, rho=4)
     seen = Refinement(
         Generator.SPHERE, Channel.RANGE, 1, 2, 1, RangeCodec.RAW, 1, 4, bytes(8), parameters=classic_sphere
@@ -219,6 +222,17 @@ def _sphere() -> tuple[m.ScanInfo, Sequence[Refinement]]:
     return info, (
         Refinement(Generator.COARSE, Channel.RANGE, 1, 0, 0, RangeCodec.RAW, 1, 136, steps),
         Refinement(Generator.COARSE, Channel.TEXTURE, 1, 1, 0, TextureCodec.HTJ2K, 255, 136, texels),
+    )
+
+
+def _round_a_pole() -> Refinement:
+    """Texture in one image."""
+    parameters = Parameters(4, 0, 0, 4, 3, polar=True)
+    strips = select_strips(build_strips(TEXTURE, parameters), ChannelHoldings.coarse(TEXTURE), texture_rank(40))
+    (shape,) = image_shapes(strips, TextureCodec.HTJ2K)
+    payload = encode_texture(np.full((*shape, 3), 90, np.uint8), TextureCodec.HTJ2K, 40)
+    return Refinement(
+        Generator.FOVEA, Channel.TEXTURE, 1, 2, 1, TextureCodec.HTJ2K, 40, math.prod(shape), payload, b"", parameters
     )
 
 
