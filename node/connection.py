@@ -30,7 +30,7 @@ from node.exhibits import Exhibits
 from node.foveate import Update
 from node.live import Live, Place
 from node.metrics import Metrics
-from node.rate import RateControl
+from node.rate import RateControl, Sending
 from protocol import messages as m
 from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
 from protocol.grid import Geometry
@@ -96,8 +96,7 @@ class Connection:
         self._news: deque[m.Published] = deque(maxlen=16)
         self._work = asyncio.Event()
         self._acknowledged = asyncio.Event()
-        self._sent_bytes, self._sent_s = 0, 0.0
-        self._is_timed = True
+        self._sending = Sending(time.monotonic())
 
     async def run(self) -> None:
         """Serve until the client goes. Never raises for what the client does."""
@@ -238,8 +237,8 @@ class Connection:
         bound = self._bound
         if bound is None or ack.epoch != bound.epoch or ack.next_seq != bound.next_seq:
             return  # of an update that a newer opening has overtaken
-        if not self._acknowledged.is_set() and self._is_timed:
-            self._rate.acknowledged(self._sent_bytes, time.monotonic() - self._sent_s, ack.apply_ms / 1000)
+        if not self._acknowledged.is_set() and (fastest := self._sending.fastest(time.monotonic())):
+            self._rate.acknowledged(*fastest, ack.apply_ms / 1000)
             self._metrics.measured(self._rate.bandwidth_bytes_s)
         if ack.digest != bound.state.holdings.digest():
             await self._send(m.Resync(bound.epoch, "digests differ"))
@@ -296,7 +295,7 @@ class Connection:
             self._acknowledged.set()
             return
         bound.next_seq = 2
-        self._begin_timing()
+        self._sending = Sending(time.monotonic())
         for refinement in view.refinements(bound.epoch):
             await self._send_bytes(refinement)
 
@@ -376,9 +375,9 @@ class Connection:
             planning.cancel()
 
     async def _send_ahead(self, bound: Bound, look: m.Look, coded: Sequence[Coded]) -> None:
-        """Send what an update begins with while the rest is planned. How long that takes says nothing of the link."""
+        """Send what an update begins with while the rest is planned."""
         self._acknowledged.clear()
-        self._is_timed = False
+        self._sending = Sending(time.monotonic())
         for refinement in bound.begin(coded, look):
             await self._send_bytes(refinement)
 
@@ -389,9 +388,11 @@ class Connection:
             await self._send(m.Resync(bound.epoch, "an update could not be ended"))
 
     async def _send_update(self, bound: Bound, look: m.Look, update: AnyUpdate, spent_s: float) -> None:
-        if update.coded and not bound.begun:
+        if bound.begun:
+            self._sending.goes_on(time.monotonic())
+        elif update.coded:
             self._acknowledged.clear()
-            self._begin_timing()
+            self._sending = Sending(time.monotonic())
         for refinement in bound.take(update, look):  # counts all of them at once, as what is said meanwhile must
             await self._send_bytes(refinement)
         if isinstance(update, Update) and update.settle is not None:
@@ -410,9 +411,6 @@ class Connection:
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
-    def _begin_timing(self) -> None:
-        self._sent_bytes, self._sent_s, self._is_timed = 0, time.monotonic(), True
-
     async def _send(self, said: m.FromNode | LiveColumns) -> None:
         if self._session.phase is Phase.CLOSED:
             return  # we have said goodbye: nobody waits for this any more
@@ -423,7 +421,7 @@ class Connection:
             await self._send_bytes(wire)
 
     async def _send_bytes(self, data: bytes) -> None:
-        self._sent_bytes += len(data)
+        self._sending.sent(len(data))
         self._metrics.sent(len(data))
         await self._socket.send_bytes(data)
 

@@ -6,6 +6,7 @@ Source: Cheng, Basu, Pan 2003, Eq. (15), with REQUIREMENTS F-15: bytes = B (T - 
 from __future__ import annotations
 
 from collections import deque
+from itertools import accumulate
 
 import numpy as np
 
@@ -15,6 +16,33 @@ RISE_MAX = 1.5
 BANDWIDTH_BYTES_S = (1e3, 1e9)
 ENCODES_KEPT = 32
 PERCENTILE = 95
+
+
+class Sending:
+    """The bytes of one update on their way, sent in one go or, when it was begun ahead of its end, in two."""
+
+    def __init__(self, now_s: float) -> None:
+        self._parts = [(now_s, 0)]
+
+    def goes_on(self, now_s: float) -> None:
+        """The rest is sent from now on."""
+        self._parts.append((now_s, 0))
+
+    def sent(self, size_bytes: int) -> None:
+        """So much more was handed over."""
+        began_s, before = self._parts[-1]
+        self._parts[-1] = began_s, before + size_bytes
+
+    def fastest(self, now_s: float) -> tuple[int, float] | None:
+        """How many bytes took how long; None where that tells nothing of the link, which stood still meanwhile.
+
+        If the beginning was still on its way when the rest was sent, all of it tells, else the rest does: the faster.
+        """
+        if len(self._parts) > 1 and self._parts[-1][1] < SAMPLE_BYTES_MIN:
+            return None
+        totals = accumulate(size_bytes for _, size_bytes in reversed(self._parts))
+        spans = [(total, now_s - began_s) for total, (began_s, _) in zip(totals, reversed(self._parts), strict=True)]
+        return max(spans, key=lambda span: span[0] / max(span[1], 1e-9))
 
 
 class RateControl:

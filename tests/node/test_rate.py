@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from node.rate import RateControl
+from node.rate import SAMPLE_BYTES_MIN, RateControl, Sending
 
 
 def test_budget_is_bandwidth_times_the_time_that_is_left() -> None:
@@ -47,3 +47,31 @@ def test_bandwidth_never_rises_by_more_than_half_at_once() -> None:
     assert rate.bandwidth_bytes_s <= 15_000
     rate.acknowledged(10_000, 0.0, 0.0)
     assert rate.bandwidth_bytes_s <= 22_500
+
+
+def in_two(ahead: int, gap_s: float, rest: int) -> Sending:
+    sending = Sending(100.0)
+    sending.sent(ahead)
+    sending.goes_on(100.0 + gap_s)
+    sending.sent(rest)
+    return sending
+
+
+def test_what_was_sent_at_once_took_as_long_as_it_took() -> None:
+    sending = Sending(100.0)
+    sending.sent(10_000)
+    sending.sent(5_000)
+    assert sending.fastest(102.0) == (15_000, 2.0)
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.05, 0.1, 0.3, 5.0])
+def test_a_link_is_as_fast_as_it_is_whatever_came_ahead(gap_s: float) -> None:
+    """20 kB ahead take 0.1 s at 200 kB/s, 40 kB after them 0.2 s more, from the end of the gap on or of the 20 kB."""
+    found = in_two(20_000, gap_s, 40_000).fastest(100.0 + max(gap_s, 0.1) + 0.2)
+    assert found is not None
+    assert found[0] / found[1] == pytest.approx(200_000)
+
+
+def test_a_short_rest_does_not_tell() -> None:
+    assert in_two(100_000, 3.0, SAMPLE_BYTES_MIN - 1).fastest(104.0) is None
+    assert in_two(100_000, 3.0, 0).fastest(103.0) is None
