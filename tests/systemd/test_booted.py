@@ -213,7 +213,7 @@ def test_the_same_again_changes_nothing_and_settings_that_do_not_fit_stop_it(mac
     machine.write(SETTINGS, settings(port, "max_clients = 0\n"))
     before = main_pid(machine)
     said = machine.foveascan("install-service", check=False)
-    assert "nothing was changed: this version does not accept the settings: server.max_clients" in said
+    assert f"nothing was changed: this version does not accept the settings: {SETTINGS}: server.max_clients" in said
     assert main_pid(machine) == before
     machine.write(SETTINGS, settings(port))
     said = machine.foveascan("install-service")
