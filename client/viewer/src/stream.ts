@@ -57,6 +57,8 @@ export class Stream {
   private isRehearsed = false;
   private request = 0;
   private opening = 0;
+  /** Whether that opening said what we hold: else a first view comes again. */
+  private hasStated = false;
   private looking: Looking | null = null;
   private applyMs = 0;
   private received = 0;
@@ -182,7 +184,7 @@ export class Stream {
   }
 
   private bind({ epoch, scan }: Extract<FromNode, { type: 'opened' }>): void {
-    if (this.model?.complete && this.model.info.id === scan.id) {
+    if (this.hasStated && this.model?.info.id === scan.id) {
       this.model.resume(epoch);
       this.wanted = scan.id;
       if (this.unseen) this.tellAll();
@@ -307,6 +309,7 @@ export class Stream {
   private sendOpen(): void {
     this.opening = ++this.request;
     const held = this.model?.complete && this.model.info.id === this.wanted ? this.model : null;
+    this.hasStated = held !== null;
     if (held) this.say({ type: 'open', request: this.opening, scan: held.info.id, holdings: held.statement() });
     else this.say({ type: 'open', request: this.opening, scan: this.wanted! });
   }

@@ -181,6 +181,17 @@ def test_a_scan_that_is_gone_is_not_replaced_by_another(browser: Browser, kept: 
     assert all("404" in problem for problem in problems), problems  # small pictures of what is gone
 
 
+def test_the_newest_scan_is_opened_again_by_an_address_that_names_none(browser: Browser, kept: Kept) -> None:
+    with opened(browser, kept.url) as page:
+        newest = page.locator("html").get_attribute("data-scan")
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        page.evaluate("location.hash = ''")
+        click(page, 0.5, 0.5)
+        wait_updates(page, 2)
+        assert page.locator("html").get_attribute("data-scan") == newest
+
+
 @pytest.mark.parametrize("name", ["head", "lumpy"])
 def test_lengths_along_a_face_and_a_closed_object_are_true(browser: Browser, kept: Kept, name: str) -> None:
     """Held against the shortest way through the samples of the truth."""
