@@ -63,7 +63,7 @@ class Lock:
         if self._handle >= 0:
             handle, self._handle = self._handle, -1
             with suppress(OSError):  # the disk is gone, and the lock with it
-                fcntl.flock(handle, fcntl.LOCK_UN)  # closing alone leaves it to a child that was just begun, for a moment
+                fcntl.flock(handle, fcntl.LOCK_UN)  # else a child that is just begun has it for a moment more
             with suppress(OSError):
                 os.close(handle)
 
