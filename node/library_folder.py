@@ -63,8 +63,6 @@ class Lock:
         if self._handle >= 0:
             handle, self._handle = self._handle, -1
             with suppress(OSError):  # the disk is gone, and the lock with it
-                fcntl.flock(handle, fcntl.LOCK_UN)  # else a child that is just begun has it for a moment more
-            with suppress(OSError):
                 os.close(handle)
 
     def __del__(self) -> None:
@@ -72,19 +70,25 @@ class Lock:
 
 
 def holder_of(folder: Path) -> int | None:
-    """Which process works in a library: its id, 0 for nobody, None where that cannot be seen. No lock is taken."""
+    """Which process works in a library: its id, 0 for nobody, None where that cannot be seen. The lock is not taken."""
     try:
-        inode = str((folder / LOCK_FILE).stat().st_ino)
+        inode = (folder / LOCK_FILE).stat().st_ino
     except FileNotFoundError:
         return 0
     except OSError:
         return None
     try:
-        locks = [line.split() for line in LOCKS.read_text().splitlines()]
+        with open(os.memfd_create("foveascan", os.MFD_CLOEXEC)) as ours:
+            fcntl.flock(ours, fcntl.LOCK_EX)  # to see whether locks are seen: there may be no others
+            lines = [line.split() for line in LOCKS.read_text().splitlines()]
+            seen = os.fstat(ours.fileno()).st_ino, os.getpid()
     except OSError:
         return None
-    holders = [lock[4] for lock in locks if lock[1:2] == ["FLOCK"] and lock[5].rpartition(":")[2] == inode]
-    return int(holders[0]) if holders else 0 if locks else None
+    held = [(int(lock[5].rpartition(":")[2]), int(lock[4])) for lock in lines if lock[1] == "FLOCK"]
+    if seen not in held:
+        return None
+    held.remove(seen)
+    return dict(held).get(inode, 0)
 
 
 def check_format(folder: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import pty
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
@@ -158,7 +159,10 @@ def server(port: int) -> settings.Server:
     return settings.Server(listen=f"127.0.0.1:{port}", insecure=True)
 
 
-def answering(body: bytes) -> HTTPServer:
+@contextmanager
+def answering(body: bytes) -> Iterator[int]:
+    """A program that answers so; gives its port."""
+
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(200)
@@ -168,7 +172,14 @@ def answering(body: bytes) -> HTTPServer:
         def log_message(self, *_: object) -> None:
             pass
 
-    return HTTPServer(("127.0.0.1", 0), Handler)
+    with HTTPServer(("127.0.0.1", 0), Handler) as program:
+        thread = Thread(target=program.serve_forever)
+        thread.start()
+        try:
+            yield program.server_port
+        finally:
+            program.shutdown()
+            thread.join()
 
 
 @pytest.mark.parametrize(
@@ -180,30 +191,21 @@ def answering(body: bytes) -> HTTPServer:
 )  # fmt: skip
 def test_a_node_at_its_address_is_fine_another_program_is_not(body: bytes, state: str) -> None:
     with answering(body) as other:
-        thread = Thread(target=other.handle_request)
-        thread.start()
-        settled = server(other.server_port)
+        settled = server(other)
         assert states(doctor.check_server(settled, doctor._who_answers(settled))) == [state]
-        thread.join()
 
 
 def test_a_node_is_known_whether_it_serves_tls_or_not() -> None:
     with answering(b'{"status": "ready"}') as node:
-        thread = Thread(target=node.serve_forever)
-        thread.start()
-        settled = settings.Server(listen=f"127.0.0.1:{node.server_port}")
+        settled = settings.Server(listen=f"127.0.0.1:{node}")
         assert doctor._who_answers(settled) == "node", "started with --insecure, of which the settings say nothing"
-        node.shutdown()
-        thread.join()
 
 
 def test_a_node_with_another_library_is_not_the_one_that_is_meant(tmp_path: Path, port: str) -> None:
     library = Library(tmp_path / "ours")
     meant = {"capture.scanner": port, "library.folder": str(tmp_path / "ours")}
     with answering(b'{"status": "ready"}') as node:
-        thread = Thread(target=node.serve_forever)
-        thread.start()
-        settled = {**meant, "server.listen": f"127.0.0.1:{node.server_port}", "discovery.enabled": False}
+        settled = {**meant, "server.listen": f"127.0.0.1:{node}", "discovery.enabled": False}
         told = {finding.check: finding for finding in doctor.examine(None, settled)}
         assert (told["server"].state, told["port"].found) == ("ok", f"{port}, in use by the node")
         library.close()
@@ -212,8 +214,6 @@ def test_a_node_with_another_library_is_not_the_one_that_is_meant(tmp_path: Path
         assert "another library" in told["server"].found
         elsewhere = {**settled, "library.folder": str(tmp_path / "not" / "there")}
         assert {finding.check: finding for finding in doctor.examine(None, elsewhere)}["server"].state == "problem"
-        node.shutdown()
-        thread.join()
 
 
 def test_a_node_at_another_address_is_told(tmp_path: Path) -> None:
