@@ -31,7 +31,7 @@ BlockArray = NDArray[np.int32]
 
 
 class PolarTexture:
-    """Both hemispheres of one texture, as maps at each spacing, as far as they reach. """
+    """Both hemispheres of one texture, as maps at each spacing, as far as they reach."""
 
     def __init__(self, texture: ImageArray) -> None:
         self._maps = dict(_maps_of(texture))
