@@ -67,6 +67,7 @@ def test_a_look_draws_its_part_of_the_picture_as_if_all_were_drawn(browser: Brow
         surface.evaluate("(one) => (one.closest('details').open = true)")
         surface.select_option("relief")
         surface.select_option("lit")
+        page.wait_for_selector('#view[data-ready="true"]')
         wait_drawn(page)
         whole = page.locator("#view").get_attribute("data-triangles")
         for number, place in enumerate(((0.5, 0.4), (0.44, 0.55)), 1):

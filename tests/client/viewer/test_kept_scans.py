@@ -187,6 +187,7 @@ def test_the_newest_scan_is_opened_again_by_an_address_that_names_none(browser: 
         click(page, 0.5, 0.5)
         wait_updates(page, 1)
         page.evaluate("location.hash = ''")
+        page.wait_for_function("() => /scan=/.test(location.hash) && !/fovea/.test(location.hash)")  # open again
         click(page, 0.5, 0.5)
         wait_updates(page, 2)
         assert page.locator("html").get_attribute("data-scan") == newest

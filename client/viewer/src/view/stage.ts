@@ -335,6 +335,7 @@ export class Stage {
     const { dataset } = this.canvas;
     dataset['drawn'] = String(Number(dataset['drawn'] ?? 0) + 1);
     dataset['triangles'] = String(triangles);
+    dataset['ready'] = String(this.surface?.isReady ?? false);
     this.events.drawn();
   }
 
