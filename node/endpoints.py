@@ -83,6 +83,7 @@ def _json(kind: Any) -> Content:
     return {"application/json": kind}
 
 
+FORM = "application/x-www-form-urlencoded"
 BINARY: Content = {"application/octet-stream": bytes}
 HTML: Content = {"text/html": bytes}
 OR_HTML: Content = {**_json(b.Error), **HTML}
@@ -92,9 +93,12 @@ MAY: tuple[tuple[pairing.Role | None, str, tuple[Endpoint, ...]], ...] = (
     (None, "pair; hear one word of the node's health", (
         Endpoint("GET", "/pair", "a page for a browser: a form for a pairing code", gives={200: HTML}, fails=(409,)),
         Endpoint(
-            "POST", "/v1/pair", "a proof of a code for a token; from the form, a cookie",
-            takes={**_json(pairing.PairRequest), "application/x-www-form-urlencoded": b.PairingForm},
-            gives={200: _json(pairing.Paired), 303: None, 400: OR_HTML, 403: OR_HTML, 429: OR_HTML}, fails=(409,),
+            "POST", "/pair", "the code from that form for a cookie", takes={FORM: b.PairingForm},
+            gives={303: None, 400: HTML, 403: OR_HTML, 429: HTML}, fails=(409,),
+        ),
+        Endpoint(
+            "POST", "/v1/pair", "a proof of a code for a token", takes=_json(pairing.PairRequest),
+            gives={200: _json(pairing.Paired)}, fails=(400, 403, 409, 429),
         ),
         Endpoint("GET", "/assets/{name}", "a part of the page", gives={200: {"*/*": bytes}, 304: None}),
         Endpoint(

@@ -123,9 +123,9 @@ def run_delete(args: argparse.Namespace) -> int:
     """Delete a scan, after asking."""
     folder = _folder(args)
     scan_id = _resolve(folder, args.scan)
-    if not args.yes and not _confirmed(f"Delete scan {scan_id} for good?"):
-        return 1
-    with _opened(folder) as library:
+    with _opened(folder) as library:  # first: who is asked shall not hear then that it cannot be
+        if not args.yes and not _confirmed(f"Delete scan {scan_id} for good?"):
+            return 1
         library.delete(scan_id)
     note_at_console(_config(args), "deleted", (scan_id,))
     return _tell(args, {"deleted": scan_id}, f"deleted {scan_id}")
@@ -145,9 +145,9 @@ def run_prune(args: argparse.Namespace) -> int:
         no_rule = config.retention.max_age_days is None and config.retention.max_gb is None
         none = "there is no rule: set retention.max_age_days or retention.max_gb" if no_rule else "nothing is to go"
         return _tell(args, said, "\n".join(lines) or none)
-    if not args.yes and not _confirmed("\n".join([*lines, f"Delete {counted(len(found), 'thing')} for good?"])):
-        return 1
     with _opened(_folder(args)) as library:
+        if not args.yes and not _confirmed("\n".join([*lines, f"Delete {counted(len(found), 'thing')} for good?"])):
+            return 1
         for one in found:
             delete(library, one)
             is_scan = one.kind == "scan"

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from node.auth import COOKIE
-from node.endpoints import ENDPOINTS, Content, Endpoint, statuses
+from node.endpoints import ENDPOINTS, FORM, Content, Endpoint, statuses
 
 OPENAPI = "3.1.0"
 REF = "#/components/schemas/{name}"
@@ -65,7 +65,8 @@ def _operation(endpoint: Endpoint, schemas: Mapping[Any, Schema], components: Ma
 def _name(endpoint: Endpoint) -> str:
     """What programs that are made of the description call it: method and path, so it is as stable as these are."""
     words = re.findall(r"\w+", endpoint.canonical.removeprefix("/v1")) or ["page"]
-    return "_".join([endpoint.method.lower(), *words])
+    form = ["form"] if FORM in (endpoint.takes or {}) else []
+    return "_".join([endpoint.method.lower(), *words, *form])
 
 
 def _parameters(

@@ -1,7 +1,8 @@
 """Letting clients in, and out again, over HTTP.
 
     GET    /pair               a page for browsers: type the code, get a cookie
-    POST   /v1/pair            a client proves a code and gets a token; that page's form sends the code itself
+    POST   /pair               that page's form sends the code itself
+    POST   /v1/pair            a client proves a code and gets a token
     POST   /v1/codes           (admin) a new code
     GET    /v1/codes           (admin) which wait
     GET    /v1/tokens          (admin) who is paired
@@ -27,7 +28,7 @@ from node.attempts import Attempts
 from node.audit import NODE, Audit, Who
 from node.auth import COOKIE, LOGIN, Refusal, asker
 from node.bodies import ListedCode, ListedToken, NewCode, Offered
-from node.endpoints import route
+from node.endpoints import FORM, route
 from node.rest import decoded, refusal, said
 from node.tls import Tls
 from protocol import pairing
@@ -55,7 +56,7 @@ machine with <code>foveascan pair --role view --name NAME</code>, and gets a fin
 <ol><li>Open your browser's certificate view (the sign left of the address). Its SHA-256 fingerprint must be the one
 that <em>came with the code</em>. If it is another, somebody is in between: stop. The node says<br>
 <code>{fingerprint}</code></li>
-<li><form method="post" action="/v1/pair"><label>The code <input name="code" autocomplete="off" required autofocus
+<li><form method="post" action="/pair"><label>The code <input name="code" autocomplete="off" required autofocus
 autocapitalize="characters" spellcheck="false" maxlength="40" placeholder="ABCD-EFGH-IJKL-MNOP"></label>
 <p><button>Pair this browser</button></p></form></li></ol></body></html>
 """
@@ -90,7 +91,8 @@ class PairingRoutes:
         """What to add to the application."""
         return [
             route("GET /pair", self._page),
-            route("POST /v1/pair", self._pair),
+            route("POST /pair", self._pair_browser),
+            route("POST /v1/pair", self._pair_client),
             route("POST /v1/codes", self._offer),
             route("GET /v1/codes", self._codes),
             route("GET /v1/tokens", self._tokens),
@@ -103,19 +105,11 @@ class PairingRoutes:
         self._known()
         return self._show()
 
-    async def _pair(self, request: web.Request) -> web.StreamResponse:
+    async def _pair_client(self, request: web.Request) -> web.Response:
         access, tls = self._known()
         body = await _bounded(request)
-        by_form = request.content_type == "application/x-www-form-urlencoded"
-        if self._failures.is_locked(request.remote or "", time.monotonic()):
-            log.warning("pairing: %s is locked", request.remote)
-            self._refused(asker(request), "locked", "too many wrong codes")
-            locked = self._show(LOCKED, 429) if by_form else refusal(429, LOCKED)
-            locked.headers["Retry-After"] = f"{WITHIN_S:.0f}"
-            return locked
-        return await (self._pair_browser(request, access) if by_form else self._pair_client(request, access, tls, body))
-
-    async def _pair_client(self, request: web.Request, access: Access, tls: Tls, body: bytes) -> web.Response:
+        if self._is_locked(request):
+            return _wait(refusal(429, LOCKED))
         asked = decoded(body, pairing.PairRequest)
         own = tls.fingerprint
 
@@ -131,8 +125,12 @@ class PairingRoutes:
         proof = pairing.node_proof(key, own, asked.nonce, text, token.role)
         return said(pairing.Paired(text, token.name, token.role, self._node_id, proof))
 
-    async def _pair_browser(self, request: web.Request, access: Access) -> web.Response:
-        form = await request.post()
+    async def _pair_browser(self, request: web.Request) -> web.Response:
+        access, _ = self._known()
+        await _bounded(request)
+        if self._is_locked(request):
+            return _wait(self._show(LOCKED, 429))
+        form = await request.post() if request.content_type == FORM else {}
         try:
             typed = pairing.key_of(pairing.parse_code(str(form.get("code", ""))))
         except LocalWireError as error:
@@ -146,6 +144,14 @@ class PairingRoutes:
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(COOKIE, text, max_age=COOKIE_S, path="/", secure=True, httponly=True, samesite="Strict")
         return response
+
+    def _is_locked(self, request: web.Request) -> bool:
+        """Whether too many wrong codes came from there; then that is noted, too."""
+        if not self._failures.is_locked(request.remote or "", time.monotonic()):
+            return False
+        log.warning("pairing: %s is locked", request.remote)
+        self._refused(asker(request), "locked", "too many wrong codes")
+        return True
 
     async def _failed(self, request: web.Request, access: Access) -> None:
         self._failures.failed(request.remote or "", time.monotonic())
@@ -209,6 +215,11 @@ class PairingRoutes:
         if self._access is None or self._tls is None:
             raise web.HTTPConflict(text=NO_LOGIN)
         return self._access, self._tls
+
+
+def _wait(locked: web.Response) -> web.Response:
+    locked.headers["Retry-After"] = f"{WITHIN_S:.0f}"
+    return locked
 
 
 async def _bounded(request: web.Request) -> bytes:

@@ -23,7 +23,7 @@ NOT_AUDITED = {  # they show, change and delete no scan, or are noted where they
     ("GET", "/v1/upkeep"),
     ("GET", "/v1/stream"),  # node.connection
     ("GET", "/v1/scans/{scan}/fovea"),  # leads to what is audited
-    ("POST", "/v1/pair"), ("POST", "/v1/codes"), ("DELETE", "/v1/tokens/{name}"),  # node.pairing
+    ("POST", "/pair"), ("POST", "/v1/pair"), ("POST", "/v1/codes"), ("DELETE", "/v1/tokens/{name}"),  # node.pairing
 }  # fmt: skip
 
 
@@ -92,7 +92,7 @@ async def test_who_comes_in_and_goes_is_noted_and_no_secret_with_it(node: Entran
     admin = node.token("admin")
     async with node.ask("POST", "/v1/codes", admin, json={"name": "room 9", "role": "view"}) as answer:
         code = (await answer.json())["code"]
-    async with node.ask("POST", "/v1/pair", data={"code": code}, headers={"Origin": node.url}) as answer:
+    async with node.ask("POST", "/pair", data={"code": code}, headers={"Origin": node.url}) as answer:
         assert answer.status == 303
         cookie = answer.cookies["__Host-foveascan"].value
     async with node.ask("DELETE", "/v1/tokens/room 9", admin):
@@ -104,7 +104,7 @@ async def test_who_comes_in_and_goes_is_noted_and_no_secret_with_it(node: Entran
     ]:
         async with node.ask("GET", path, headers=headers):
             pass
-    async with node.ask("POST", "/v1/pair", data={"code": code}, headers={"Origin": node.url}) as answer:
+    async with node.ask("POST", "/pair", data={"code": code}, headers={"Origin": node.url}) as answer:
         assert answer.status == 403
     assert noted(node)[1:] == [
         ("code offered", "admin", "", "room 9: view"),

@@ -77,11 +77,13 @@ def test_a_name_cannot_steer_the_terminal(folder: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr().out.splitlines()[0].endswith(r"red \x1b[31m\nline")
 
 
-def test_list_works_while_a_node_runs_and_rename_does_not(folder: Path) -> None:
+def test_list_works_while_a_node_runs_and_changes_do_not(folder: Path) -> None:
     library = Library(folder)
     assert run("list", "--library", folder) == 0
     with pytest.raises(LibraryError, match="in use by process"):
         run("rename", "latest", "x", "--library", folder)
+    with pytest.raises(LibraryError, match="in use by process"):  # and not, that nobody can be asked
+        run("delete", "latest", "--library", folder)
     library.close()
 
 

@@ -93,7 +93,7 @@ async def test_the_page_shows_the_fingerprint_and_runs_no_script(node: Entrance)
 
 async def test_a_code_typed_in_the_page_becomes_a_cookie_no_script_can_read(node: Entrance) -> None:
     form = {"code": node.offer("tablet").lower()}
-    async with node.ask("POST", "/v1/pair", data=form, headers={"Origin": node.url}) as answer:
+    async with node.ask("POST", "/pair", data=form, headers={"Origin": node.url}) as answer:
         assert (answer.status, answer.headers["Location"]) == (303, "/")
         cookie = answer.headers["Set-Cookie"]
     name, _, rest = cookie.partition("=")
@@ -108,16 +108,27 @@ async def test_a_code_typed_in_the_page_becomes_a_cookie_no_script_can_read(node
 async def test_a_wrong_code_shows_the_page_again_and_counts(node: Entrance) -> None:
     statuses = []
     for code in ["<b>", *["AAAA-AAAA-AAAA-AAAA"] * (routes.ADDRESS_FAILURES + 1)]:
-        async with node.ask("POST", "/v1/pair", data={"code": code}, headers={"Origin": node.url}) as answer:
+        async with node.ask("POST", "/pair", data={"code": code}, headers={"Origin": node.url}) as answer:
             statuses.append(answer.status)
             page = await answer.text()
             assert 'role="alert"' in page and "<b>" not in page and "Set-Cookie" not in answer.headers
     assert statuses == [400, *[403] * routes.ADDRESS_FAILURES, 429]
+    async with node.ask("GET", answer.url.path) as answer:  # as a browser does that loads it anew
+        assert answer.status == 200 and 'role="alert"' not in await answer.text()
+
+
+async def test_a_form_that_is_none_shows_the_page_again(node: Entrance) -> None:
+    body = b'--x\r\nContent-Disposition: form-data; name="code"\r\n\r\n' + node.offer().encode() + b"\r\n--x"
+    for kind in ("multipart/form-data; boundary=x", "application/json"):
+        headers = {"Origin": node.url, "Content-Type": kind}
+        async with node.ask("POST", "/pair", data=body, headers=headers) as answer:
+            assert answer.status == 400 and 'role="alert"' in await answer.text()
+    assert node.access.tokens() == ()
 
 
 async def test_another_sites_page_cannot_pair_a_browser(node: Entrance) -> None:
     origin = {"Origin": "https://evil.example"}
-    async with node.ask("POST", "/v1/pair", data={"code": node.offer()}, headers=origin) as answer:
+    async with node.ask("POST", "/pair", data={"code": node.offer()}, headers=origin) as answer:
         assert answer.status == 403
     assert node.access.tokens() == ()
 

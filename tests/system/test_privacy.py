@@ -78,8 +78,8 @@ async def a_day_in_the_clinic(url: str, library: Path, folder: Path) -> list[str
             ("GET", f"{place}/fovea?u=0.5&v=0.5&{NAME}=1", {}),
             ("GET", f"{place}.glb", {}),
             ("POST", f"{url}/v1/scans", {"data": NOTES.encode() * 100}),
-            ("POST", f"{url}/v1/pair", {"data": {"code": "WRNG-CODE-AAAA-AAAA"}, "headers": {"Origin": url}}),
-            ("POST", f"{url}/v1/pair", {"data": {"code": code}, "headers": {"Origin": url}}),
+            ("POST", f"{url}/pair", {"data": {"code": "WRNG-CODE-AAAA-AAAA"}, "headers": {"Origin": url}}),
+            ("POST", f"{url}/pair", {"data": {"code": code}, "headers": {"Origin": url}}),
             ("GET", f"{url}/v1/scans", {"headers": {"Authorization": "Bearer wrong-token-4711"}}),
             ("GET", f"{url}/v1/scans", {"headers": {"Origin": f"https://{NAME}.example"}}),
         ]:
