@@ -74,7 +74,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Kept]:
     grids |= {name: GENERATORS["cylinder"](shape, 1) for name, shape in (("fitting", FITTING), ("wide", WIDE))}
     grids["lumpy"] = grid_of(STANDING)
     grids["later"] = later(grids["head"])
-    grids["brief"] = GENERATORS["cylinder"](SHAPES["cylinder"], 2)
+    grids |= {name: GENERATORS["cylinder"](SHAPES["cylinder"], seed) for name, seed in (("brief", 2), ("passing", 3))}
     with ExitStack() as stack, ThreadPoolExecutor(1) as aside:  # playwright keeps this thread's event loop
         ids = aside.submit(keep, folder, grids).result()
         serve = ["serve", "--library", str(folder), "--listen", "127.0.0.1:0", "--insecure", "--json"]
@@ -179,6 +179,20 @@ def test_a_scan_that_is_gone_is_not_replaced_by_another(browser: Browser, kept: 
         page.get_by_role("button", name="brief").wait_for(state="detached")
         assert not page.get_by_text("This scan", exact=True).is_visible()
     assert all("404" in problem for problem in problems), problems  # small pictures of what is gone
+
+
+def test_a_scan_that_was_deleted_is_shown_for_ten_seconds_at_most(browser: Browser, kept: Kept) -> None:
+    with blank(browser) as (page, problems):
+        page.clock.install()
+        page.goto(kept.at("passing"))
+        page.wait_for_selector("html[data-scan]", state="attached")
+        page.get_by_role("button", name="passing").wait_for()
+        assert page.request.delete(f"{kept.url}/v1/scans/{kept.ids['passing']}").ok
+        page.clock.pause_at(page.evaluate("Date.now() / 1000 + 1"))  # from now on time is what we say
+        page.clock.run_for(10_000)
+        page.get_by_text("That scan is not there any more.").wait_for()
+        page.wait_for_selector("html:not([data-scan])", state="attached")
+    assert all("404" in problem for problem in problems), problems
 
 
 def test_the_newest_scan_is_opened_again_by_an_address_that_names_none(browser: Browser, kept: Kept) -> None:
