@@ -73,12 +73,13 @@ export class App {
     const shared = {
       say, options: () => this.look.options, home: () => this.home(), undone: () => this.latest.undo(), changed: () => this.writeState(),
       received: (bytes: number) => this.cost.traffic(bytes), updated: (answer: Answer) => this.cost.answered(answer),
-      measured: (measured: Measured) => this.measured(measured),
+      measured: (measured: Measured) => this.measured(measured), dropped: () => this.comparison.takeBack(),
     };
     this.pane = new Pane((message) => this.tell(message), canvas, context, {
       ...shared,
       opened: (info, fresh, framed) => this.opened(info, fresh, framed),
       missing: () => this.missing(),
+      pressed: (place) => this.pressed(this.pane, place),
       clicked: (place) => this.clicked(this.pane, place),
       hovered: (place) => this.hovered(this.pane, place),
       moved: () => this.comparison?.moved(this.pane),
@@ -86,6 +87,7 @@ export class App {
     this.latest = this.pane.measuring;
     this.comparison = new Comparison(this.pane, this.frame.pictures, hire, {
       ...shared,
+      pressed: (place) => this.pressed(this.comparison.picture!, place),
       clicked: (place) => this.clicked(this.comparison.picture!, place),
       hovered: (place) => this.hovered(this.comparison.picture!, place),
       changed: () => {
@@ -202,7 +204,7 @@ export class App {
     if (camera) this.pane.stage.place(camera);
     this.beginMeasuring();
     this.pins.show(pins);
-    this.pane.sharpenAll(foveae);
+    this.pane.looks.all(foveae);
     if (this.isAddressed && beside) this.comparison.open(beside);
     else if (this.isAddressed || this.comparison.state?.scan === scan) this.comparison.close();
     this.writeState();
@@ -249,6 +251,10 @@ export class App {
     this.state = { ...NOWHERE, scan: id };
     this.isAddressed = false;
     this.pane.open(id);
+  }
+
+  private pressed(pane: Pane, place: Place): void {
+    if (!this.sweep.isWatched && this.look.tools.tool === 'sharpen') this.comparison.lookAhead(pane, place);
   }
 
   private clicked(pane: Pane, place: Place | null): void {
@@ -397,7 +403,7 @@ export class App {
   private recorded(info: ScanInfo, refinements: Uint8Array | null): void {
     const scan = this.scans.scans.find(({ id }) => id === info.id);
     const { shading, overlay } = this.display;
-    const view = formatState({ scan: info.id, camera: this.pane.stage.placed, foveae: this.pane.foveae, pins: this.pins.list, beside: null });
+    const view = formatState({ scan: info.id, camera: this.pane.stage.placed, foveae: this.pane.looks.foveae, pins: this.pins.list, beside: null });
     const held: Held = {
       info, view, shading, overlay, made: new Date().toISOString(), swept: scan?.created ?? null, node: this.node,
       about: this.isCopyNamed && scan ? strings.scans.about(scan) : '',
@@ -411,9 +417,9 @@ export class App {
   private writeState(): void {
     this.writing ??= setTimeout(() => {
       this.writing = undefined;
-      const { info, foveae, stage } = this.pane;
+      const { info, looks, stage } = this.pane;
       if (!info || this.sweep.isWatched) return;
-      const fragment = formatState({ ...this.state, scan: info.id, camera: stage.placed, foveae, pins: this.pins.list, beside: this.comparison.state });
+      const fragment = formatState({ ...this.state, scan: info.id, camera: stage.placed, foveae: looks.foveae, pins: this.pins.list, beside: this.comparison.state });
       history.replaceState(null, '', `#${fragment}`);
     }, WRITE_MS);
   }

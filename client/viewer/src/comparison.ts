@@ -35,6 +35,8 @@ export class Comparison {
   private isFollowing = false;
   /** Until the scan beside is there, its camera says nothing. */
   private isShown = false;
+  /** A place that is pressed, and where that asks for detail. */
+  private pressed: { place: Place; looks: [Pane, Place][] } | null = null;
 
   constructor(
     private readonly pane: Pane, private readonly pictures: HTMLElement, private readonly hire: (scan: string) => Worker,
@@ -45,7 +47,7 @@ export class Comparison {
   get state(): Beside | null {
     const { beside, other } = this;
     if (!beside || other?.info?.id !== beside.scan) return beside;
-    return { scan: beside.scan, camera: other.stage.placed, foveae: other.foveae };
+    return { scan: beside.scan, camera: other.stage.placed, foveae: other.looks.foveae };
   }
 
   /** The picture of the scan beside; null while there is none. */
@@ -107,13 +109,29 @@ export class Comparison {
 
   /** Get detail at a place of one picture, and at what is seen there in the other. */
   sharpen(pane: Pane, place: Place): void {
-    pane.sharpen(place);
+    const looks = this.pressed?.place === place ? this.pressed.looks : this.looksAt(pane, place);
+    for (const [one, there] of looks) one.sharpen(there);
+  }
+
+  /** Ask for that already: the place is pressed, and will be sharpened if it is clicked. */
+  lookAhead(pane: Pane, place: Place): void {
+    this.pressed = { place, looks: this.looksAt(pane, place) };
+    for (const [one, there] of this.pressed.looks) one.lookAhead(there);
+  }
+
+  /** What was pressed was not clicked. */
+  takeBack(): void {
+    for (const [one, there] of this.pressed?.looks ?? []) one.looks.takeBack(there);
+    this.pressed = null;
+  }
+
+  private looksAt(pane: Pane, place: Place): [Pane, Place][] {
     const { picture } = this;
-    if (!picture || !this.moves.sharpenBoth || !this.moves.together) return;
+    if (!picture || !this.moves.sharpenBoth || !this.moves.together) return [[pane, place]];
     const twin = pane === this.pane ? picture : this.pane;
     const at = pane.stage.sight.project(place);
     const seen = at && twin.stage.sight.pickOnPicture(at.x, at.y);
-    if (seen) twin.sharpen(seen);
+    return seen ? [[pane, place], [twin, seen]] : [[pane, place]];
   }
 
   private build(): Pane | null {
@@ -158,7 +176,7 @@ export class Comparison {
     if (camera && !this.moves.together) picture.stage.place(camera);
     else this.moved(this.pane);
     picture.measuring.clear();
-    picture.sharpenAll(foveae);
+    picture.looks.all(foveae);
     void this.showPins(scan);
     this.events.changed();
   }

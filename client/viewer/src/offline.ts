@@ -51,7 +51,7 @@ export class OfflineCopy {
       measured: (measured) => this.measured(measured),
       undone: () => this.pane.measuring.undo(),
       options: () => ({ window: 0, textureDb: 0, rangeMm: 0 }), // nobody is asked
-      hovered: nothing, moved: nothing, changed: nothing, updated: nothing, received: nothing, missing: nothing,
+      pressed: nothing, dropped: nothing, hovered: nothing, moved: nothing, changed: nothing, updated: nothing, received: nothing, missing: nothing,
     }, document.documentElement);
     this.display = new DisplayPanel(() => this.pane.stage.setLook(this.display.shading, this.display.overlay), held.shading, held.overlay);
     const pins = new PinsPanel(nothing, nothing, (pin) => this.pane.stage.face(pin));

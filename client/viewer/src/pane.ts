@@ -1,6 +1,7 @@
-// One picture with one scan in it: shows what the worker says of it, and asks for detail, one look after the other.
+// One picture with one scan in it: shows what the worker says of it, and asks for detail.
 
 import type { Answer, FromWorker, LookOptions, ToWorker } from './link.ts';
+import { Looks } from './looks.ts';
 import { Measuring } from './measuring.ts';
 import type { Measured } from './measuring.ts';
 import type { ScanInfo } from './protocol/messages.ts';
@@ -27,8 +28,12 @@ export interface PaneEvents {
   updated(answer: Answer): void;
   /** There is no such scan. */
   missing(): void;
+  /** The pointer is down there: a click, perhaps. */
+  pressed(place: Place): void;
   /** Somebody clicked there, or asked for the middle; null: where nothing was measured. */
   clicked(place: Place | null): void;
+  /** What was pressed was not clicked. */
+  dropped(): void;
   /** The pointer is there. */
   hovered(place: () => Place | null): void;
   home(): void;
@@ -51,15 +56,12 @@ export class Pane {
   readonly measuring: Measuring;
   /** The scan in the picture; null while another one is on its way. */
   info: ScanInfo | null = null;
-  /** Where detail was got, in order. */
-  foveae: Place[] = [];
+  readonly looks: Looks;
   /** Kept once a first picture stands, or none will soon. */
   readonly pictured: Promise<void>;
   private painted!: () => void;
   private poster: HTMLImageElement | null = null;
-  private looks = 0;
-  private looking: { look: number; place: Place } | null = null;
-  private queue: Place[] = [];
+  private pressed: Place | null = null;
   private bytes = 0;
   private readonly noted: HTMLElement;
 
@@ -86,9 +88,21 @@ export class Pane {
     }, calm);
     this.marks = new Marks(this.stage.sight);
     this.measuring = new Measuring(this.stage.sight, this.marks, (measured) => this.events.measured(measured));
+    this.looks = new Looks({
+      ask: (look, { u, v }) => this.tell({ kind: 'look', look, u, v, options: this.events.options() }),
+      cancel: (look) => this.tell({ kind: 'cancel', look }),
+      awaited: (place) => this.await(place),
+      answered: (answer) => this.answered(answer),
+      ended: () => this.events.changed(),
+    });
     this.element.append(this.marks.element);
     listen(canvas, {
-      click: (x, y) => this.events.clicked(this.stage.sight.pick(x, y)),
+      press: (x, y) => {
+        this.pressed = this.stage.sight.pick(x, y);
+        if (this.pressed) this.events.pressed(this.pressed);
+      },
+      click: () => this.events.clicked(this.pressed),
+      drop: () => this.events.dropped(),
       hover: (x, y) => this.events.hovered(() => this.stage.sight.pick(x, y)),
       turn: (across, up) => this.stage.turn(across, up),
       pan: (right, up) => this.stage.pan(right, up),
@@ -96,7 +110,7 @@ export class Pane {
       home: () => this.events.home(),
       act: () => this.events.clicked(this.stage.sight.pickMiddle()),
       undo: () => this.events.undone(),
-      cancel: () => this.cancel(),
+      cancel: () => this.looks.cancel(),
     });
   }
 
@@ -115,7 +129,8 @@ export class Pane {
         this.stage.paintNow();
         break;
       case 'updated':
-        this.updated(said.answer);
+        if (said.answer.reason !== 'superseded') this.measuring.renew();
+        this.looks.answered(said.answer);
         break;
       case 'refused':
         this.refused(said);
@@ -156,31 +171,20 @@ export class Pane {
     this.showMeanwhile(null);
     this.info = null;
     delete this.noted.dataset['scan'];
-    this.endLook();
-    [this.queue, this.foveae] = [[], []];
+    this.looks.clear();
     this.stage.clear();
     this.marks.setPins([]);
     this.measuring.clear();
   }
 
-  /** Get detail at a place, whatever was asked for before. */
+  /** Get detail at a place. */
   sharpen(place: Place): void {
-    if (!this.info) return;
-    this.queue = [];
-    this.ask(place);
+    if (this.info) this.looks.at(place);
   }
 
-  /** Want no more of what is on its way. */
-  cancel(): void {
-    this.queue = [];
-    if (this.looking) this.tell({ kind: 'cancel', look: this.looking.look });
-  }
-
-  /** Get detail at places, one after the other. */
-  sharpenAll(places: Place[]): void {
-    this.foveae = [];
-    this.queue = [...places];
-    this.next();
+  /** Ask for it, since the place is pressed. */
+  lookAhead(place: Place): void {
+    if (this.info) this.looks.ahead(place);
   }
 
   private drawn(): void {
@@ -201,43 +205,20 @@ export class Pane {
     this.stage.paintNow();
   }
 
-  private updated(answer: Answer): void {
-    const counts = answer.reason !== 'superseded';
-    if (counts) {
-      this.noted.dataset['updates'] = String(Number(this.noted.dataset['updates'] ?? 0) + 1);
-      this.measuring.renew();
-      this.events.updated(answer);
-    }
-    if (answer.look !== this.looking?.look) return;
-    if (counts) this.foveae.push(this.looking.place);
-    this.endLook();
-    this.next();
-    this.events.changed();
+  private answered(answer: Answer): void {
+    this.noted.dataset['updates'] = String(Number(this.noted.dataset['updates'] ?? 0) + 1);
+    this.events.updated(answer);
   }
 
   private refused({ look, code, message }: Extract<OfScan, { kind: 'refused' }>): void {
-    if (look === this.looking?.look) this.endLook();
+    this.looks.refused(look);
     if (code === 'not found') this.events.missing();
     else if (code === 'not open' && this.info) this.open(this.info.id); // it was deleted: the node will say so
     else this.events.say(strings.failed(message));
   }
 
-  private ask(place: Place): void {
-    const look = ++this.looks;
-    this.looking = { look, place };
+  private await(place: Place | null): void {
     this.marks.setBusy(place);
-    this.noted.dataset['looking'] = 'yes';
-    this.tell({ kind: 'look', look, u: place.u, v: place.v, options: this.events.options() });
-  }
-
-  private next(): void {
-    const place = this.queue.shift();
-    if (place) this.ask(place);
-  }
-
-  private endLook(): void {
-    this.looking = null;
-    this.marks.setBusy(null);
-    this.noted.dataset['looking'] = 'no';
+    this.noted.dataset['looking'] = place ? 'yes' : 'no';
   }
 }

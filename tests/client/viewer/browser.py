@@ -55,13 +55,18 @@ def opened(browser: Browser, address: str, allowed: str = "\0", **options: Any) 
     Fails afterwards if it complained or asked anybody else. allowed : what it may complain of.
     """
     with blank(browser, **options) as (page, problems):
-        page.goto(address)
-        page.wait_for_selector("html[data-scan]", state="attached")
-        page.wait_for_selector("#app:not(.early) aside details", state="attached")  # panels come after the picture
-        wait_drawn(page)
+        show(page, address)
         yield page
     unexpected = [problem for problem in problems if allowed not in problem]
     assert not unexpected, unexpected
+
+
+def show(page: Page, address: str) -> None:
+    """Have a page show an address, until a scan is drawn and all stands round it."""
+    page.goto(address)
+    page.wait_for_selector("html[data-scan]", state="attached")
+    page.wait_for_selector("#app:not(.early) aside details", state="attached")  # panels come after the picture
+    wait_drawn(page)
 
 
 @contextmanager
@@ -94,11 +99,18 @@ def wait_updates(page: Page, count: int) -> None:
     wait_drawn(page)
 
 
-def click(page: Page, x: float, y: float, view: str = "#view") -> None:
-    """Click the picture at shares of its width and height."""
+def point_at(page: Page, x: float, y: float, view: str = "#view") -> None:
+    """Move the pointer to shares of the picture's width and height."""
     box = page.locator(view).bounding_box()
     assert box is not None
-    page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+
+
+def click(page: Page, x: float, y: float, view: str = "#view") -> None:
+    """Click the picture at shares of its width and height."""
+    point_at(page, x, y, view)
+    page.mouse.down()
+    page.mouse.up()
 
 
 def crop(page: Page, x: float, y: float, side: int, view: str = "#view") -> Picture:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,13 +22,16 @@ from node.journal import Journals
 from protocol.grid import GridSpec
 from protocol.scanner_messages import DeviceInfo, RangeColumn, SweepHeader
 from tests.client.viewer.browser import (
+    WAIT_MS,
     barriers,
     blank,
     click,
     crop,
     layout_faults,
     opened,
+    point_at,
     psnr,
+    show,
     wait_drawn,
     wait_updates,
 )
@@ -37,6 +42,17 @@ FAST = ("--link-rate", "20000000")
 NOTE_SHOWN = """(bar) => new MutationObserver(() => {
   if (!bar.hidden) document.documentElement.dataset.shown = 'yes';
 }).observe(bar, { attributes: true })"""
+
+
+# In which order the page asks, and hears that the pointer was let go.
+NOTE_PRESSES = """() => {
+  const [noted, post] = [(window.noted = []), Worker.prototype.postMessage];
+  addEventListener('pointerup', () => noted.push('let go'), true);
+  Worker.prototype.postMessage = function (message, ...more) {
+    if (message.kind === 'look') noted.push('look');
+    return post.call(this, message, ...more);
+  };
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +75,48 @@ def test_a_click_sharpens_what_it_is_at(browser: Browser, node: RunningNode) -> 
         full = crop(page, *click_at, 90)
     assert psnr(sharp, full) >= 32
     assert psnr(sharp, full) >= psnr(coarse, full) + 6
+
+
+def test_a_press_asks_for_what_its_click_shows(browser: Browser, node: RunningNode) -> None:
+    with blank(browser) as (page, problems):
+        said = conversation(page)
+        show(page, node.url)
+        page.evaluate(NOTE_PRESSES)
+        click(page, 0.5, 0.42)
+        wait_updates(page, 1)
+        page.wait_for_url("**fovea=**")
+        assert page.evaluate("window.noted") == ["look", "let go"]
+        assert [kind for kind in said if kind in ("look", "cancel")] == ["look"] and problems == []
+
+
+def test_a_press_that_becomes_a_drag_is_no_look(browser: Browser, node: RunningNode) -> None:
+    """What it has brought is held and seen; what it has not is called off."""
+    with blank(browser) as (page, problems):
+        said = conversation(page)
+        show(page, node.url)
+        before = crop(page, 0.5, 0.42, 90)
+        point_at(page, 0.5, 0.42)
+        page.mouse.down()
+        until(page, lambda: said.count("ack") == 2)
+        wait_drawn(page)
+        assert psnr(crop(page, 0.5, 0.42, 90), before) < 30, "it is not seen"
+        point_at(page, 0.6, 0.42)
+        page.mouse.up()
+        os.kill(node.process.pid, signal.SIGSTOP)
+        try:
+            point_at(page, 0.5, 0.6)
+            page.mouse.down()
+            point_at(page, 0.45, 0.6)
+            page.mouse.up()
+            until(page, lambda: said.count("cancel") == 1)
+        finally:
+            os.kill(node.process.pid, signal.SIGCONT)
+        click(page, 0.5, 0.5)
+        wait_updates(page, 1)
+        page.wait_for_url("**fovea=**")
+        assert page.url.count("fovea=") == 1
+        assert said.count("look") == 3 and not {"state", "resync"} & {*said}, "both ends disagree"
+        assert problems == []
 
 
 def test_a_look_draws_its_part_of_the_picture_as_if_all_were_drawn(browser: Browser, node: RunningNode) -> None:
@@ -321,6 +379,26 @@ def watch_a_sweep(page: Page) -> None:
     page.wait_for_selector('html[data-live="no"][data-scan]', state="attached")
     wait_drawn(page)
     assert psnr(crop(page, 0.5, 0.45, 200), empty) < 25
+
+
+def conversation(page: Page) -> list[str]:
+    """The types of all messages that a page and its node will exchange as text, as they do."""
+    said = list[str]()
+
+    def note(frame: str | bytes) -> None:
+        if isinstance(frame, str):
+            said.append(json.loads(frame)["type"])
+
+    page.on("websocket", lambda socket: [socket.on(way, note) for way in ("framesent", "framereceived")])
+    return said
+
+
+def until(page: Page, is_so: Callable[[], bool]) -> None:
+    """Wait for what the page does."""
+    end_s = time.monotonic() + WAIT_MS / 1000
+    while not is_so():
+        assert time.monotonic() < end_s
+        page.wait_for_timeout(20)
 
 
 def exactly(page: Page) -> None:

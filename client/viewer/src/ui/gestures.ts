@@ -8,8 +8,12 @@ const ARROWS: Record<string, [across: number, up: number]> = {
 };
 
 export interface Meanings {
-  /** A click or tap, at a point of the page. */
-  click(x: number, y: number): void;
+  /** The pointer is down at a point of the page: a click or tap, perhaps. */
+  press(x: number, y: number): void;
+  /** That was one. */
+  click(): void;
+  /** That is none, or hardly: it moves, is held, is joined by another, is called off. */
+  drop(): void;
   /** The pointer rests or moves there, a few times a second. */
   hover(x: number, y: number): void;
   turn(across: number, up: number): void;
@@ -26,20 +30,35 @@ export interface Meanings {
 
 /** Hear what people do on the picture. */
 export function listen(canvas: HTMLCanvasElement, to: Meanings): void {
-  let down: PointerEvent | null = null;
+  let pressed: PointerEvent | null = null;
+  let patience: ReturnType<typeof setTimeout> | undefined;
   let hovered = 0;
-  canvas.addEventListener('pointerdown', (event) => (down = event.isPrimary ? event : null));
-  canvas.addEventListener('pointerup', (event) => {
-    const still = down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < CLICK_PX;
-    if (still && event.button === 0 && event.timeStamp - down!.timeStamp < CLICK_MS) to.click(event.clientX, event.clientY);
-    down = null;
+  const isNear = ({ clientX, clientY }: PointerEvent): boolean =>
+    pressed !== null && Math.hypot(clientX - pressed.clientX, clientY - pressed.clientY) < CLICK_PX;
+  const end = (isClick: boolean): void => {
+    if (!pressed) return;
+    pressed = null;
+    clearTimeout(patience);
+    if (isClick) to.click();
+    else to.drop();
+  };
+  canvas.addEventListener('pointerdown', (event) => {
+    end(false);
+    if (!event.isPrimary || event.button !== 0 || event.ctrlKey || event.metaKey || event.shiftKey) return; // that moves the picture
+    pressed = event;
+    patience = setTimeout(to.drop, CLICK_MS); // if this thread was kept, it may have been a click all the same
+    to.press(event.clientX, event.clientY);
   });
+  canvas.addEventListener('pointerup', (event) => end(isNear(event) && event.timeStamp - pressed!.timeStamp < CLICK_MS));
+  canvas.addEventListener('pointercancel', () => end(false));
   canvas.addEventListener('pointermove', (event) => {
-    if (down || event.timeStamp - hovered <= HOVER_MS) return;
+    if (!isNear(event)) end(false);
+    if (event.buttons || event.timeStamp - hovered <= HOVER_MS) return;
     hovered = event.timeStamp;
     to.hover(event.clientX, event.clientY);
   });
   canvas.addEventListener('keydown', (event) => {
+    if (event.key === 'Escape') end(false);
     if (!event.ctrlKey && !event.metaKey && !event.altKey && keyed(event, to)) event.preventDefault();
   });
 }

@@ -75,8 +75,9 @@ export class Stage {
   private asked = false;
   /** What is to be drawn anew. */
   private due: Part | 'all' | null = 'all';
-  /** Whether the camera is being moved by hand. */
+  /** Whether the camera is being moved by hand, not only held. */
   moving = false;
+  private isHeld = false;
   /** Nobody has moved the camera since it was put where it sees everything. */
   private isFramed = false;
   private pace = 1;
@@ -100,10 +101,14 @@ export class Stage {
     Object.assign(this.controls, { enableDamping: !calm, dampingFactor: 0.12, zoomToCursor: true, rotateSpeed: 0.7 });
     this.controls.addEventListener('change', () => {
       this.draw();
-      this.events.moved();
+      if (this.isHeld && !this.moving) this.move(true);
+      else this.events.moved();
     });
-    this.controls.addEventListener('start', () => this.move(true));
-    this.controls.addEventListener('end', () => this.move(false));
+    this.controls.addEventListener('start', () => (this.isHeld = true));
+    this.controls.addEventListener('end', () => {
+      this.isHeld = false;
+      if (this.moving) this.move(false);
+    });
     canvas.addEventListener('webglcontextlost', (event) => {
       event.preventDefault();
       this.clear(); // now, while deleting what is gone does nothing
