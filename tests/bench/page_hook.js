@@ -3,7 +3,7 @@
 // stands there before, and when what a frame needs was there first. Says on the console when a frame is finished, and
 // changes nothing that a page does.
 (() => {
-  const bench = (window.bench = { frames: [], messages: [], painting: [], tasks: [], first: {}, clicked: null, answer: null, poster: null });
+  const bench = (window.bench = { frames: [], messages: [], painting: [], tasks: [], first: {}, pressed: null, clicked: null, looked: null, answer: null, poster: null });
   const first = (name) => (bench.first[name] ??= performance.now());
   const timed = (note, work) => {
     const begin = performance.now();
@@ -20,6 +20,7 @@
   new PerformanceObserver((list) => {
     for (const { identifier, renderTime } of list.getEntries()) if (identifier === 'poster') bench.poster ??= renderTime;
   }).observe({ type: 'element', buffered: true });
+  addEventListener('pointerdown', () => (bench.pressed = performance.now()), true);
   addEventListener('pointerup', () => (bench.clicked = performance.now()), true);
 
   const ask = window.requestAnimationFrame.bind(window);
