@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, WebSocket
 
 from foveascan import started
 from node.journal import Journals
@@ -389,7 +389,11 @@ def conversation(page: Page) -> list[str]:
         if isinstance(frame, str):
             said.append(json.loads(frame)["type"])
 
-    page.on("websocket", lambda socket: [socket.on(way, note) for way in ("framesent", "framereceived")])
+    def hear(socket: WebSocket) -> None:
+        socket.on("framesent", note)
+        socket.on("framereceived", note)
+
+    page.on("websocket", hear)
     return said
 
 
