@@ -84,8 +84,8 @@ class Truth:
         """Cells of a window; on a sphere those that are samples of their own, since they are equally far apart."""
         if self.geometry == "cylinder":
             region = region_round(u, v, window, width, height)
-            return region.inside(np.arange(height), np.arange(width))
-        inside = cap_region(u, v, window, width, height).inside(np.arange(height), np.arange(width))
+            return region.inside(np.arange(height), range(width))
+        inside = cap_region(u, v, window, width, height).inside(np.arange(height), range(width))
         return np.asarray(inside & (np.arange(width) % _strides(width, height, side)[:, None] == 0))
 
     def _area(self, width: int, height: int) -> FloatArray:

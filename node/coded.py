@@ -208,6 +208,6 @@ def own_inside(region: Region, selection: Selection) -> BoolArray:
 
 @lru_cache(maxsize=16)
 def _inside(region: Region, top: int, height: int, left: int, width: int, stride: int) -> BoolArray:
-    inside = region.inside(np.arange(top, top + height), np.arange(left, left + width) * stride)
+    inside = region.inside(np.arange(top, top + height), range(left * stride, (left + width) * stride, stride))
     inside.flags.writeable = False
     return inside

@@ -141,7 +141,7 @@ def _allowed_beyond(scan: Scan, region: Region) -> float:
     void = scan.range_steps[region.rows].take(region.columns, axis=1) == VOID
     area = region.area
     if void.any():
-        inside = region.inside(rows, np.arange(region.left, region.left + region.width))
+        inside = region.inside(rows, range(region.left, region.left + region.width))
         area -= float(np.count_nonzero(inside & void, axis=1) @ region.sample_area(rows))
     return max(area - 1, 0) * (100 - PERCENTILE) / 100
 

@@ -82,10 +82,10 @@ class RangeModel:
         for stride in np.unique(sent).tolist():
             known, wanted = self._known[p, stride], rows[sent == stride]
             first = region.left // stride
-            columns = np.arange(first, first + -(-region.width // stride))
+            stop = first + -(-region.width // stride)
             place = np.searchsorted(known.row, wanted)
-            codes = known.codes[place].take(columns % known.codes.shape[1], axis=1)
-            counts += _counted(codes, region, wanted, columns * stride) * stride
+            codes = known.codes[place].take(np.arange(first, stop) % known.codes.shape[1], axis=1)
+            counts += _counted(codes, region, wanted, range(first * stride, stop * stride, stride)) * stride
         if not counts[:UNMEASURED].any():
             return 0.0
         return float(2 ** (percentile_of(counts[:UNMEASURED]) / AN_OCTAVE) - 1)
@@ -98,7 +98,7 @@ def _strides(spec: GridSpec, p: int) -> IntArray:
     return ring_strides(spec.width, spec.height, RANGE_BLOCK, 2 * p).repeat(RANGE_BLOCK)[: spec.height]
 
 
-def _counted(codes: NDArray[np.uint8], region: Region, rows: IntArray, columns: IntArray) -> FloatArray:
+def _counted(codes: NDArray[np.uint8], region: Region, rows: IntArray, columns: range) -> FloatArray:
     """How often each code stands in a region, by area. (256,)"""
     inside, area = region.inside(rows, columns), region.sample_area(rows)
     if (area == 1).all():

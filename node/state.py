@@ -71,8 +71,7 @@ class ClientState:
         left, top, wide, high = region.blocks(RANGE_BLOCK)
         place = np.arange(top, top + high)[:, None], np.arange(left, left + wide)[None, :] % self.error.shape[1]
         row = np.arange(top * RANGE_BLOCK, (top + high) * RANGE_BLOCK)
-        column = np.arange(left * RANGE_BLOCK, (left + wide) * RANGE_BLOCK)
-        cells = region.inside(row, column)
+        cells = region.inside(row, range(left * RANGE_BLOCK, (left + wide) * RANGE_BLOCK))
         if region.turn % RANGE_BLOCK:
             cells |= cells.any(axis=1, keepdims=True)  # behind a cut block columns are not where they seem: count all
         inside = np.packbits(cells, axis=1)

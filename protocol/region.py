@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.grid import BoolArray, FloatArray, IntArray
 
@@ -40,10 +41,10 @@ class Region:
         """How large a sample of each of its rows (n,) is. (n,), 1 in the middle of the grid"""
         return np.ones(rows.size)
 
-    def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
-        """Which of rows x columns (not wrapped) lie in it. (rows, columns) bool"""
+    def inside(self, rows: IntArray, columns: range) -> BoolArray:
+        """Which of rows (any) x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
         down = (rows >= self.top) & (rows < self.top + self.height)
-        return np.logical_and.outer(down, (columns - self.left) % self.turn < self.width)
+        return np.logical_and.outer(down, (np.array(columns) - self.left) % self.turn < self.width)
 
     def counts(self, side: int) -> IntArray:
         """How many of its samples lie in each block of `blocks`. (rows, columns) int64"""
@@ -51,8 +52,8 @@ class Region:
         edges = _edges(first, wide, side, self.turn)
         rows = np.diff(np.clip(side * np.arange(top, top + high + 1), self.top, self.top + self.height))
         once = np.zeros(1, np.int64)
-        columns = _run_counts(once, once + self.left, once + self.width, (1, edges), self.turn)
-        return np.asarray(np.multiply.outer(rows, columns[0]))
+        columns = _run_counts(once + self.left, once + self.width, edges, self.turn)
+        return np.asarray(np.multiply.outer(rows, columns[0]), np.int64)
 
     def blocks(self, side: int) -> tuple[int, int, int, int]:
         """Blocks of the rectangle round it: first column, first row, columns, rows; from 0 when it is all round."""
@@ -88,25 +89,25 @@ class Cap(Region):
         """How large a sample of each row is, 1 on the equator; of rows outside, as large as of the nearest inside."""
         return self.row_share[np.clip(rows - self.top, 0, self.height - 1)]
 
-    def inside(self, rows: IntArray, columns: IntArray) -> BoolArray:
-        """Which of rows x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
+    def inside(self, rows: IntArray, columns: range) -> BoolArray:
+        """Which of rows (any) x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
         row = np.clip(rows - self.top, 0, self.height - 1)
         left, width = self.row_left[row], np.where(row == rows - self.top, self.row_width[row], 0)
         begin = columns[0] - (columns[0] - left) % self.turn  # of the run round the first column, or left of it
-        turns = self.turn * np.arange((int(columns[-1]) - int(begin.min())) // self.turn + 1)
+        turns = self.turn * np.arange((columns[-1] - int(begin.min())) // self.turn + 1)
         runs = begin[:, None, None] + turns[:, None] + np.stack([np.zeros_like(width), width], axis=1)[:, None]
-        edges = np.searchsorted(columns, runs).reshape(rows.size, -1)
-        lengths = np.diff(edges, axis=1, prepend=0, append=columns.size).ravel()
+        edges = np.clip(-((columns[0] - runs) // columns.step), 0, len(columns)).reshape(rows.size, -1)
+        lengths = np.diff(edges, axis=1, prepend=0, append=len(columns)).ravel()
         inside = np.repeat(np.arange(lengths.size) % (2 * turns.size + 1) % 2 == 1, lengths)
-        return np.asarray(inside.reshape(rows.size, columns.size))
+        return np.asarray(inside.reshape(rows.size, len(columns)))
 
     def counts(self, side: int) -> IntArray:
         """How many of its samples lie in each block of `blocks`. (rows, columns) int64, read-only"""
         if side not in self._counts:
             first, top, wide, high = self.blocks(side)
-            row = np.arange(self.top, self.top + self.height) // side - top
-            edges = _edges(first, wide, side, self.turn)
-            counts = _run_counts(row, self.row_left, self.row_width, (high, edges), self.turn)
+            of_row = _run_counts(self.row_left, self.row_width, _edges(first, wide, side, self.turn), self.turn)
+            starts = np.maximum(side * np.arange(top, top + high) - self.top, 0)
+            counts = np.add.reduceat(of_row, starts, axis=0, dtype=np.int64)
             counts.flags.writeable = False
             self._counts[side] = counts
         return self._counts[side]
@@ -126,24 +127,16 @@ def _edges(first: int, wide: int, side: int, turn: int) -> IntArray:
     return turns * turn + column * side
 
 
-def _run_counts(
-    row: IntArray, left: IntArray, width: IntArray, blocks: tuple[int, IntArray], turn: int
-) -> IntArray:
-    """How many columns of runs (n,), cyclic, lie in each block: of a row of blocks each, and between these edges.
-
-    Counted by where runs begin and end, so that it takes as long as there are runs. (rows of blocks, edges - 1) int64
-    """
-    high, edges = blocks
-    sizes, wide = np.diff(edges), edges.size - 1
-    begin = edges[0] - (edges[0] - left) % turn  # of the run round the first edge, or left of it
-    turns = turn * np.arange((int(edges[-1]) - int(begin.min())) // turn + 1)[:, None]
-    ends = np.clip(np.concatenate([begin + turns, begin + turns + width]), edges[0], edges[-1]).ravel()
-    block = np.minimum(np.searchsorted(edges, ends, side="right") - 1, wide - 1)
-    sign = np.repeat([1, -1], ends.size // 2)
-    row = np.tile(row, ends.size // row.size)
-    part = np.bincount(row * wide + block, sign * (edges[block + 1] - ends), high * wide).reshape(high, wide)
-    behind = np.bincount(row * (wide + 1) + block + 1, sign, high * (wide + 1)).reshape(high, wide + 1)
-    return np.asarray(part + behind[:, :wide].cumsum(axis=1) * sizes, np.int64)
+def _run_counts(left: IntArray, width: IntArray, edges: IntArray, turn: int) -> NDArray[np.int32]:
+    """How many columns of each of some runs (n,), cyclic, lie between edges. (n, edges - 1)"""
+    begin = (edges[0] - (edges[0] - left) % turn).astype(np.int32)  # of the run round the first edge, or left of it
+    first, last, size = int(begin.min()), int((begin + width).max()), width.astype(np.int32)[:, None]
+    behind = np.subtract.outer(-begin, -edges.astype(np.int32))  # how far each edge is behind it
+    upto = np.zeros(behind.shape, np.int32)  # how many of the columns lie before each edge
+    for shift in range(0, int(edges[-1]) - first, turn):
+        if last + shift > edges[0]:
+            upto += np.minimum(np.maximum(behind - shift, 0), size)
+    return np.diff(upto, axis=1)
 
 
 @lru_cache(maxsize=256)

@@ -128,20 +128,20 @@ def cap_region(u: float, v: float, share: float, width: int, height: int) -> Cap
     """
     radius_rad = math.acos(max(1 - 2 * share, -1.0))
     polar_rad, column, row = math.pi * v, int(u * width), int(v * height)
-    theta_v = np.pi * (np.arange(height) + 0.5) / height
-    nearest = np.abs(theta_v - polar_rad)
+    first, last = (math.floor((polar_rad + side * radius_rad) * height / math.pi) for side in (-1, 1))
+    rows = np.arange(max(first - 1, 0), min(last + 2, height))
+    rows = rows[(np.abs(np.pi * (rows + 0.5) / height - polar_rad) <= radius_rad) | (rows == row)]
+    theta_v = np.pi * (rows + 0.5) / height
+    sine = np.sin(theta_v)
     farthest = np.minimum(theta_v + polar_rad, 2 * np.pi - theta_v - polar_rad)
-    rows = np.union1d(np.flatnonzero(nearest <= radius_rad), [row])
-    theta_v, farthest = theta_v[rows], farthest[rows]
-    sines = np.sin(theta_v) * max(math.sin(polar_rad), 1e-12)
-    cosine = (math.cos(radius_rad) - np.cos(theta_v) * math.cos(polar_rad)) / sines
+    cosine = (math.cos(radius_rad) - np.cos(theta_v) * math.cos(polar_rad)) / (sine * max(math.sin(polar_rad), 1e-12))
     half = np.where(farthest <= radius_rad, np.pi, np.arccos(np.clip(cosine, -1, 1))) * width / (2 * np.pi)
     left = np.ceil(u * width - half - 0.5).astype(np.int64)
     wide = np.minimum(np.floor(u * width + half - 0.5).astype(np.int64) - left + 1, width)
     left, wide = np.where(wide < 1, column, left), np.maximum(wide, 1)
     widest = int((left + wide).max() - left.min())
     bounds = (0, width) if widest >= width else (int(left.min()), widest)
-    return Cap(bounds[0], int(rows[0]), bounds[1], rows.size, width, left, wide, np.sin(theta_v))
+    return Cap(bounds[0], int(rows[0]), bounds[1], rows.size, width, left, wide, sine)
 
 
 def region_on(spec: GridSpec, u: float, v: float, share: float, width: int, height: int) -> Region:

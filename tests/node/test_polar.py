@@ -186,7 +186,7 @@ def test_a_look_near_a_pole_takes_one_image_and_reaches_its_quality(
         client.apply(one.refinement(1, seq, 1))
     assert client.digest() == update.state.holdings.digest()
     cap = cap_region(0.3, v, 0.05, SHAPE.width, SHAPE.height)
-    inside = cap.inside(np.arange(SHAPE.height), np.arange(SHAPE.width)) * np.sin(
+    inside = cap.inside(np.arange(SHAPE.height), range(SHAPE.width)) * np.sin(
         DirectionGrid(SHAPE.width, SHAPE.height).theta_v(np.arange(SHAPE.height))
     )[:, None]
     squared = ((client.texture.astype(float) - scan.texture) ** 2).mean(axis=-1)
