@@ -379,7 +379,7 @@ class TextureSearch:
             return
         sent, polar = self._sent(coded), self._is_polar(p)
         expected, worse = self._place(p).expect(sent), 1.0
-        is_whole = polar or self._scan.spec.geometry == "cylinder"
+        is_whole = polar or len(coded.parts) == 1
         if is_whole and mse is not None and bool((sent == self._held.touched).all()):
             worse = mse / expected.mse(coded.quality)
         taken = expected.size_bytes(coded.quality), len(coded.payload)
