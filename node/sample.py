@@ -17,7 +17,7 @@ from protocol.grid import VOID, BoolArray, ImageArray, IntArray, StepArray
 from protocol.lattice import QUARTERS, Axis
 from protocol.reconstruct import Selection, Window, cut, every
 
-FILL_CELL = 4
+FILL_CELL = 4  # texels
 
 
 def range_samples(scan: Scan, selection: Selection) -> tuple[StepArray, BoolArray]:
@@ -96,30 +96,34 @@ def texture_samples(scan: Scan, selection: Selection) -> ImageArray:
     return texels if selection.adopted.all() else smoothed(texels, _stencil(selection))
 
 
-def smoothed(texels: ImageArray, seen: BoolArray) -> ImageArray:
+def smoothed(texels: ImageArray, seen: BoolArray, cell: int = FILL_CELL) -> ImageArray:
     """Texels with those unseen taken from means of what is seen round them, ever wider ones: what a wavelet codes in
-    few bytes. The nearest seen texel's colour instead took a fifth more for a whole patch."""
+    few bytes. The nearest seen texel's colour instead took a fifth more for a whole patch.
+
+    cell : side of the smallest that are averaged, a power of two.
+    """
     height, width = seen.shape
-    cells = -(-height // FILL_CELL), -(-width // FILL_CELL)
-    whole = cells[0] * FILL_CELL, cells[1] * FILL_CELL
+    cells = -(-height // cell), -(-width // cell)
+    whole = cells[0] * cell, cells[1] * cell
     mask = seen.view(np.uint8)
     known, share = np.zeros((*whole, 3), np.uint8), np.zeros(whole, np.uint8)
     cv2.copyTo(np.ascontiguousarray(texels), mask, known[:height, :width])
     share[:height, :width] = mask * np.uint8(255)
-    total, seen_share = (_quartered(image).astype(np.float32) for image in (known, share))
+    total, seen_share = (_shrunk(image, cell).astype(np.float32) for image in (known, share))
     means = np.clip(_means(total, seen_share / np.float32(255)), 0, 255).astype(np.uint8)
     filled = cv2.resize(means, whole[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
     cv2.copyTo(known[:height, :width], mask, filled)
     return np.asarray(filled, np.uint8)
 
 
-def _quartered(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Means of 4 by 4: halving twice is what OpenCV does quickest."""
-    for _ in range(2):
+def _shrunk(image: NDArray[np.uint8], cell: int) -> NDArray[np.uint8]:
+    """Means of square cells: halving again and again is what OpenCV does quickest."""
+    while cell > 1:
         size = image.shape[1] // 2, image.shape[0] // 2
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8).reshape(
             *size[::-1], *image.shape[2:]
         )
+        cell //= 2
     return image
 
 
