@@ -27,7 +27,7 @@ from protocol.reconstruct import Selection, range_patch
 from protocol.refinement import CRC, HEADER, Generator, Refinement, pack_parameters
 from protocol.region import Cap, Region
 from protocol.rings import ring_strides
-from protocol.strips import Strip, Strips, join_parts, samples_of
+from protocol.strips import Strip, Strips, join_parts, samples_of, strip_texture
 
 FRAME_BYTES = 10  # WebSocket's own, at most
 MERGED_SAMPLES = 2.0
@@ -40,14 +40,14 @@ class Part:
     """What one strip of a refinement carries, encoded.
 
     mask, decoded, void : range only, the samples as a client decodes them and which cells of its patch are void.
-    patch : texture only, what a client makes of it; None where nobody measured it.
+    image : texture only, what it travels in as a client decodes it; None where nobody measured it.
     """
 
     strip: Strip
     mask: bytes = b""
     decoded: StepArray | None = None
     void: BoolArray | None = None
-    patch: ImageArray | None = None
+    image: ImageArray | None = None
 
     @property
     def selection(self) -> Selection:
@@ -62,6 +62,12 @@ class Part:
         patch[self.void] = VOID
         patch.flags.writeable = False
         return patch
+
+    @cached_property
+    def texture(self) -> ImageArray:
+        """The patch that a client makes of a measured strip's texture. (rows, columns, 3) uint8"""
+        assert self.image is not None  # measured before
+        return strip_texture(self.strip, self.image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,14 +206,18 @@ def _strips_of(rows: list[_Rows], strides: tuple[int, ...]) -> tuple[int, float]
     return count, samples
 
 
-def own_inside(region: Region, selection: Selection) -> BoolArray:
-    """Which own samples of a selection's rectangle lie in a region. (rows, columns) bool, read-only"""
-    rows = selection.y.start, selection.y.low.size
-    return _inside(region, *rows, selection.x.start, int(selection.x.size.sum()), selection.lattice.shape.stride)
+def own_inside(region: Region, selection: Selection, every: int = 1) -> BoolArray:
+    """Which own samples of a selection's rectangle lie in a region, or of every so many of its rows and columns.
+
+    (rows, columns) bool, read-only
+    """
+    stride, (left, width) = selection.lattice.shape.stride, (selection.x.start, int(selection.x.size.sum()))
+    rows = selection.y.start, selection.y.start + selection.y.low.size, every
+    return _inside(region, rows, range(left * stride, (left + width) * stride, every * stride))
 
 
 @lru_cache(maxsize=16)
-def _inside(region: Region, top: int, height: int, left: int, width: int, stride: int) -> BoolArray:
-    inside = region.inside(np.arange(top, top + height), range(left * stride, (left + width) * stride, stride))
+def _inside(region: Region, rows: tuple[int, int, int], columns: range) -> BoolArray:
+    inside = region.inside(np.arange(*rows), columns)
     inside.flags.writeable = False
     return inside

@@ -17,13 +17,15 @@ from node.sample import texture_samples
 from node.state import ClientState
 from node.texture_model import SPACINGS
 from protocol.codec import JPEG_QUALITY_MAX, JPEG_QUALITY_MIN, LOSSY_MAX, TextureCodec, decode_texture, encode_textures
-from protocol.grid import TEXTURE_BLOCK, ImageArray
+from protocol.grid import TEXTURE_BLOCK, BoolArray, ImageArray
 from protocol.holdings import ChannelHoldings, texture_rank
 from protocol.lattice import Channel, Lattice, Parameters
 from protocol.messages import CodecName, TextureParameters
+from protocol.polar import texels_at
 from protocol.reconstruct import Selection, cut, texture_patch
 from protocol.region import Region
 from protocol.strips import (
+    Strip,
     Strips,
     build_strips,
     image_shape,
@@ -31,11 +33,11 @@ from protocol.strips import (
     join_parts,
     select_strips,
     split_parts,
-    texture_patches,
 )
 
 CODECS = {"jpeg": TextureCodec.JPEG, "htj2k": TextureCodec.HTJ2K}
 NARROW_ROWS, NARROW_TO = 4, 3 * TEXTURE_BLOCK  # rows from a pole whose texels' width changes within a block
+SAMPLED_FROM, SAMPLED_MORE = 1 << 16, 1.003  # texels of a window; a quarter of so many tells its error to 0.15%
 SHARE_OF_ERROR = 0.3  # of the squared error allowed, what the spacing may take; the codec has the rest
 
 
@@ -147,14 +149,13 @@ def settle_texture(scan: Scan, state: ClientState, coded: Coded) -> None:
     for part in coded.parts:
         rows, columns = np.nonzero(part.selection.adopted)
         blocks = part.selection.y.block[rows], part.selection.x.block[columns]
-        state.missed[blocks] = np.nan if part.patch is None else _block_errors(scan, part)[rows, columns]
+        state.missed[blocks] = np.nan if part.image is None else _block_errors(scan, part)[rows, columns]
 
 
 def _block_errors(scan: Scan, part: Part) -> NDArray[np.float32]:
     """Squared error per value in each block of a measured strip's rectangle."""
-    assert part.patch is not None
     selection = part.selection
-    missed = cv2.absdiff(part.patch, np.asarray(cut(scan.texture, selection)))[:, : int(selection.x.size.sum())]
+    missed = cv2.absdiff(part.texture, np.asarray(cut(scan.texture, selection)))[:, : int(selection.x.size.sum())]
     squared = cv2.multiply(missed, missed, dtype=cv2.CV_32F).reshape(len(missed), -1)
     ends_y, ends_x = (np.cumsum(window.size) for window in (selection.y, selection.x))
     bands = (squared[end - high : end] for high, end in zip(selection.y.size.tolist(), ends_y.tolist(), strict=True))
@@ -164,15 +165,15 @@ def _block_errors(scan: Scan, part: Part) -> NDArray[np.float32]:
 
 
 def measured(coded: Coded) -> Coded:
-    """A refinement with the texture that a client makes of it."""
-    if coded.parts[0].patch is not None:
+    """A refinement with the images that a client decodes."""
+    if coded.parts[0].image is not None:
         return coded
     codec, quality = TextureCodec(coded.codec), int(coded.quality)
     shapes = image_shapes(coded.strips, codec)
     payloads = zip(split_parts(coded.payload, len(shapes)), shapes, strict=True)
-    patches = texture_patches(coded.strips, [decode_texture(data, codec, quality, shape) for data, shape in payloads])
-    parts = zip(coded.parts, patches, strict=True)
-    return replace(coded, parts=tuple(replace(part, patch=patch) for part, patch in parts))
+    images = [decode_texture(data, codec, quality, shape) for data, shape in payloads]
+    parts = zip(coded.parts, images * len(coded.parts) if coded.parameters.polar else images, strict=True)
+    return replace(coded, parts=tuple(replace(part, image=image) for part, image in parts))
 
 
 class Compared:
@@ -181,14 +182,60 @@ class Compared:
     def __init__(self, scan: Scan, selection: Selection, region: Region) -> None:
         wanted = selection.adopted_cells() & own_inside(region, selection)
         self._own = slice(0, wanted.shape[1])
-        self._truth = np.ascontiguousarray(np.asarray(cut(scan.texture, selection))[:, self._own])
-        self._wanted, self._bands = wanted.view(np.uint8), tuple(_bands(selection))
-        self._values = sum(area * 3 * cv2.countNonZero(self._wanted[rows]) for rows, area in self._bands)
+        truth = np.ascontiguousarray(np.asarray(cut(scan.texture, selection))[:, self._own])
+        self._against = _Against(truth, wanted, tuple(_bands(selection)))
 
     def error(self, patch: ImageArray) -> tuple[float, float]:
         """Squared error of a patch there, and of how many values. On a sphere a value counts for the area it has, 1 on
         the equator."""
-        patch, truth, wanted = np.ascontiguousarray(patch[:, self._own]), self._truth, self._wanted
+        return self._against.error(np.ascontiguousarray(patch[:, self._own]))
+
+    def part_error(self, part: Part) -> tuple[float, float]:
+        """The same of a measured strip's patch."""
+        return self.error(part.texture)
+
+
+class ComparedPolar:
+    """The same of a strip that travels in an image of a pole.
+
+    Of a window of many texels every second is taken, along and across: taking more texels out of an image is what
+    takes most time then, and tells no more. What is left is called SAMPLED_MORE worse for that.
+    """
+
+    def __init__(self, scan: Scan, strip: Strip, region: Region) -> None:
+        assert strip.polar is not None
+        selection, (self._more, every) = strip.selection, (SAMPLED_MORE, 2) if region.area >= SAMPLED_FROM else (1.0, 1)
+        inside = own_inside(region, selection, every)
+        rows = selection.y.start + every * np.arange(inside.shape[0])
+        columns = (selection.x.start + every * np.arange(inside.shape[1])) * selection.lattice.shape.stride
+        truth = scan.texture[rows[0] : rows[-1] + 1 : every].take(columns % scan.spec.texture_width, axis=1)
+        bands = ((slice(-(-b.start // every), -(-b.stop // every)), every**2 * area) for b, area in _bands(selection))
+        self._places = strip.polar.places(rows, columns)
+        self._against = _Against(truth, selection.adopted_cells()[::every, ::every] & inside, tuple(bands))
+
+    def part_error(self, part: Part) -> tuple[float, float]:
+        """As of Compared."""
+        assert part.image is not None  # measured before
+        error, values = self._against.error(texels_at(self._places, part.image))
+        return self._more * error, values
+
+
+def compared_with(scan: Scan, strip: Strip, region: Region) -> Compared | ComparedPolar:
+    """What a strip is held against."""
+    if strip.polar is not None:
+        return ComparedPolar(scan, strip, region)
+    return Compared(scan, strip.selection, region)
+
+
+class _Against:
+    """Texels that others are held against, where they are wanted. bands : of rows, each with the area of a texel."""
+
+    def __init__(self, truth: ImageArray, wanted: BoolArray, bands: tuple[tuple[slice, float], ...]) -> None:
+        self._truth, self._wanted, self._bands = truth, wanted.view(np.uint8), bands
+        self._values = sum(area * 3 * cv2.countNonZero(self._wanted[rows]) for rows, area in bands)
+
+    def error(self, patch: ImageArray) -> tuple[float, float]:
+        truth, wanted = self._truth, self._wanted
         norms = (area * cv2.norm(patch[rows], truth[rows], cv2.NORM_L2SQR, wanted[rows]) for rows, area in self._bands)
         return sum(norms), self._values
 

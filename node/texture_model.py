@@ -30,6 +30,7 @@ from protocol.codec import (
 )
 from protocol.grid import BoolArray, FloatArray, ImageArray, IntArray
 from protocol.lattice import STRIDES
+from protocol.polar import texels_at
 from protocol.region import Region
 from protocol.rings import limited_strides, ring_strides
 
@@ -311,7 +312,7 @@ def _survey_maps(
             if unwanted():
                 raise CancelledError
             payload = encode_texture(image, codec, quality)
-            seen = place.texels_at(rows, columns, decode_texture(payload, codec, quality, place.sample_shape))
+            seen = texels_at(place.places(rows, columns), decode_texture(payload, codec, quality, place.sample_shape))
             missed = _cell_errors(truth, seen, CELL // COMPARED_EVERY)
             weight = area * _weights(detail, missed)
             taken = max(DISC_SHARE * (len(payload) - measured.constant[index]), 1.0)

@@ -24,8 +24,10 @@ from node.quality import MARGIN, MARGIN_CYLINDER, TRIES, Encodes, Point, Quality
 from node.refine_texture import (
     CODECS,
     Compared,
+    ComparedPolar,
     choose_spacing,
     code_texture_strips,
+    compared_with,
     measured,
     mse_of_db,
     quality_bounds,
@@ -97,7 +99,7 @@ class TextureSearch:
         self._least: dict[tuple[int, tuple[int, ...] | None], int] = {}
         self._tried: dict[tuple[int, float, Carried], Coded] = {}
         self._images: dict[tuple[int, Carried], list[ImageArray]] = {}
-        self._compared: dict[tuple[int, Carried], list[Compared]] = {}
+        self._compared: dict[tuple[int, Carried], list[Compared | ComparedPolar]] = {}
         self.limited = False
         self.mse: float | None = None
 
@@ -353,17 +355,16 @@ class TextureSearch:
         total, count = 0.0, 0.0
         if coded is not None:
             for compared, part in zip(self._held_against(coded), coded.parts, strict=True):
-                assert part.patch is not None  # measured before
-                error, values = compared.error(part.patch)
+                error, values = compared.part_error(part)
                 total, count = total + error, count + values
         held_total, held_count = self._held.error(self._held.left_alone(coded), most=coded is not None)
         return (total + held_total) / max(count + held_count, 1)
 
-    def _held_against(self, coded: Coded) -> list[Compared]:
+    def _held_against(self, coded: Coded) -> list[Compared | ComparedPolar]:
         """What its patches are compared with, of each part."""
         key = coded.parameters.half_spacing, _carried(coded.strips)
         if key not in self._compared:
-            self._compared[key] = [Compared(self._scan, strip.selection, self._region) for strip in coded.strips]
+            self._compared[key] = [compared_with(self._scan, strip, self._region) for strip in coded.strips]
         return self._compared[key]
 
     def _sent(self, coded: Coded) -> BoolArray:

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.grid import TEXTURE_BLOCK, FloatArray, ImageArray, IntArray
 from protocol.lattice import Lattice
 from protocol.reconstruct import Selection
 
+Places = tuple[NDArray[np.float32], NDArray[np.float32]]  # columns and rows of an image, (rows, columns) each
 PLACE_DIGITS = 6  # of a place on the map before it is cut to whole samples: no machine's sine decides
 
 
@@ -90,16 +92,21 @@ class PolarImage:
         """What texture_patch is for a strip's own samples: the same from this image of the map. (rows, columns, 3)"""
         rows = selection.y.start + np.arange(selection.y.low.size)
         columns = (selection.x.start + np.arange(selection.x.low.size)) * selection.lattice.shape.stride
-        return self.texels_at(rows, columns, image)
+        return texels_at(self.places(rows, columns), image)
 
-    def texels_at(self, rows: IntArray, columns: IntArray, image: ImageArray) -> ImageArray:
-        """Texels of some rows and columns, interpolated. (rows, columns, 3) uint8"""
+    def places(self, rows: IntArray, columns: IntArray) -> Places:
+        """Where some rows and columns lie in it."""
         radius, angle = self.place.radius(rows).astype(np.float32), self.place.angle(columns)
         x, y = (
             np.multiply.outer(radius, along.astype(np.float32)) - np.float32(first + 0.5)
             for along, first in ((np.cos(angle), self.left), (np.sin(angle), self.top))
         )
-        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return x, y
+
+
+def texels_at(places: Places, image: ImageArray) -> ImageArray:
+    """Texels of an image at places, interpolated. (rows, columns, 3) uint8"""
+    return np.asarray(cv2.remap(image, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def polar_image(selections: Sequence[Selection]) -> PolarImage:

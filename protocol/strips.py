@@ -108,10 +108,15 @@ def image_shapes(strips: Strips, codec: TextureCodec) -> list[tuple[int, int]]:
 
 def texture_patches(strips: Strips, images: Sequence[ImageArray]) -> list[ImageArray]:
     """Dense texture of each strip's rectangle from the images of a payload. (rows, columns, 3) uint8 each"""
-    if (polar := strips[0].polar) is not None:
-        return [polar.patch(strip.selection, images[0]) for strip in strips]
-    selections = [strip.selection for strip in strips]
-    return [texture_patch(one, image[: one.sample_shape[0]]) for one, image in zip(selections, images, strict=True)]
+    travelled = [images[0]] * len(strips) if strips[0].polar else images
+    return [strip_texture(strip, image) for strip, image in zip(strips, travelled, strict=True)]
+
+
+def strip_texture(strip: Strip, image: ImageArray) -> ImageArray:
+    """The same of one strip from the image that it travels in."""
+    if strip.polar is not None:
+        return strip.polar.patch(strip.selection, image)
+    return texture_patch(strip.selection, image[: strip.selection.sample_shape[0]])
 
 
 def image_shape(selection: Selection, codec: TextureCodec) -> tuple[int, int]:

@@ -114,8 +114,7 @@ def _db(published: Scan, coded: Coded, window: Window, seen: ImageArray) -> floa
     """PSNR in the window once a texture refinement is in."""
     dense = np.array(seen)
     for part in measured(coded).parts:
-        assert part.patch is not None
-        paste(dense, part.patch, part.selection)
+        paste(dense, part.texture, part.selection)
     return psnr_db(crop(dense, window.texture), window.texels)
 
 
