@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from protocol.grid import BoolArray, FloatArray, IntArray
 
@@ -52,8 +51,8 @@ class Region:
         edges = _edges(first, wide, side, self.turn)
         rows = np.diff(np.clip(side * np.arange(top, top + high + 1), self.top, self.top + self.height))
         once = np.zeros(1, np.int64)
-        columns = _run_counts(once + self.left, once + self.width, edges, self.turn)
-        return np.asarray(np.multiply.outer(rows, columns[0]), np.int64)
+        columns = _run_counts(once, once + self.left, once + self.width, (1, edges), self.turn)
+        return np.asarray(np.multiply.outer(rows, columns[0]))
 
     def blocks(self, side: int) -> tuple[int, int, int, int]:
         """Blocks of the rectangle round it: first column, first row, columns, rows; from 0 when it is all round."""
@@ -105,9 +104,9 @@ class Cap(Region):
         """How many of its samples lie in each block of `blocks`. (rows, columns) int64, read-only"""
         if side not in self._counts:
             first, top, wide, high = self.blocks(side)
-            of_row = _run_counts(self.row_left, self.row_width, _edges(first, wide, side, self.turn), self.turn)
-            starts = np.maximum(side * np.arange(top, top + high) - self.top, 0)
-            counts = np.add.reduceat(of_row, starts, axis=0, dtype=np.int64)
+            row = np.arange(self.top, self.top + self.height) // side - top
+            edges = _edges(first, wide, side, self.turn)
+            counts = _run_counts(row, self.row_left, self.row_width, (high, edges), self.turn)
             counts.flags.writeable = False
             self._counts[side] = counts
         return self._counts[side]
@@ -127,16 +126,28 @@ def _edges(first: int, wide: int, side: int, turn: int) -> IntArray:
     return turns * turn + column * side
 
 
-def _run_counts(left: IntArray, width: IntArray, edges: IntArray, turn: int) -> NDArray[np.int32]:
-    """How many columns of each of some runs (n,), cyclic, lie between edges. (n, edges - 1)"""
-    begin = (edges[0] - (edges[0] - left) % turn).astype(np.int32)  # of the run round the first edge, or left of it
-    first, last, size = int(begin.min()), int((begin + width).max()), width.astype(np.int32)[:, None]
-    behind = np.subtract.outer(-begin, -edges.astype(np.int32))  # how far each edge is behind it
-    upto = np.zeros(behind.shape, np.int32)  # how many of the columns lie before each edge
-    for shift in range(0, int(edges[-1]) - first, turn):
-        if last + shift > edges[0]:
-            upto += np.minimum(np.maximum(behind - shift, 0), size)
-    return np.diff(upto, axis=1)
+def _run_counts(
+    row: IntArray, left: IntArray, width: IntArray, blocks: tuple[int, IntArray], turn: int
+) -> IntArray:
+    """How many columns of runs (n,), cyclic, lie in each block: of a row of blocks each, and between these edges.
+
+    Counted by where runs begin and end, so that it takes as long as there are runs. (rows of blocks, edges - 1) int64
+    """
+    high, edges = blocks
+    sizes, wide = np.diff(edges), edges.size - 1
+    begin = edges[0] - (edges[0] - left) % turn  # of the run round the first edge, or left of it
+    turns = [
+        begin + shift
+        for shift in range(0, int(edges[-1]) - int(begin.min()), turn)
+        if int((begin + width).max()) + shift > edges[0]
+    ]
+    ends = np.clip(np.concatenate([*turns, *(each + width for each in turns)]), edges[0], edges[-1])
+    block = np.minimum(np.searchsorted(edges, ends, side="right") - 1, wide - 1)
+    sign = np.repeat([1, -1], ends.size // 2)
+    row = np.concatenate([row] * (ends.size // row.size))
+    part = np.bincount(row * wide + block, sign * (edges[block + 1] - ends), high * wide).reshape(high, wide)
+    behind = np.bincount(row * (wide + 1) + block + 1, sign, high * (wide + 1)).reshape(high, wide + 1)
+    return np.asarray(part + behind[:, :wide].cumsum(axis=1) * sizes, np.int64)
 
 
 @lru_cache(maxsize=256)
