@@ -152,7 +152,6 @@ class Place:
         self._measured, self._content, self._mse, self._area = measured, content, mse, 1.0 / stride
         self._denser = np.zeros(stride.size) if sent is None else STRETCHED * np.log2(stride / sent)
         self._images = 1 if sent is None else 1 + np.count_nonzero(np.diff(sent))
-        self._is_even = bool((stride == 1).all())
 
     def expect(self, among: BoolArray) -> Expected:
         """What some blocks, (rows, columns) of Region.blocks, will take and reach."""
@@ -165,8 +164,10 @@ class Place:
     def _sums(self, among: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Bytes and, by area, squared error at each quality. (qualities,) each"""
         counted = among.astype(np.float32)
-        if self._is_even:
-            content, mse = (values.reshape(len(values), -1) @ counted.ravel() for values in (self._content, self._mse))
+        if not self._denser.any():
+            by_area = counted * self._area[:, None].astype(np.float32)
+            pairs = (self._content, counted), (self._mse, by_area)
+            content, mse = (values.reshape(len(values), -1) @ of_block.ravel() for values, of_block in pairs)
             return content.astype(np.float64), mse.astype(np.float64)
         content, mse = (
             np.einsum("qrc,rc->qr", values, counted).astype(np.float64) for values in (self._content, self._mse)
@@ -230,8 +231,13 @@ class TextureModel:
         """The same region again and again, each time with other blocks of it; arguments as of `expect`."""
         measured = self._measured[codec, p, strides is None]
         left, top, wide, high = region.blocks(CELL)
-        rows, columns = slice(top, top + high), np.arange(left, left + wide) % self._cells[1]
-        content, mse = (values[:, rows].take(columns, axis=2) for values in (measured.content, measured.mse))
+        rows, stop = slice(top, top + high), left + wide - self._cells[1]
+        content, mse = (
+            np.ascontiguousarray(values[:, rows, left : left + wide])
+            if stop <= 0
+            else np.concatenate([values[:, rows, left:], values[:, rows, :stop]], axis=2)
+            for values in (measured.content, measured.mse)
+        )
         stride = self._stride[rows]
         return Place(measured, content, mse, stride, None if strides is None else limited_strides(stride, strides))
 

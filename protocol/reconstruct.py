@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import cv2
@@ -124,6 +125,7 @@ def select(lattice: Lattice, held: ChannelHoldings, rank: int) -> tuple[Selectio
     return Selection(lattice, y, x, core), adopted
 
 
+@lru_cache(maxsize=64)
 def _window(axis: Axis, begin: int, end: int, beyond: int = 0) -> Window:
     begin_at, end_at = int(axis.first[begin]), int(axis.last[end - 1]) + 1
     at = axis.at[begin_at:end_at]
@@ -182,7 +184,8 @@ def _blend(samples: NDArray[Any], window: Window, axis: int) -> NDArray[Any]:
     low = samples.take(window.low, axis)
     if not window.part.any():
         return low
-    part, whole = (np.expand_dims(number.astype(samples.dtype), 1 - axis) for number in (window.part, window.whole))
+    along = (1, -1) if axis else (-1, 1)
+    part, whole = (number.astype(samples.dtype).reshape(along) for number in (window.part, window.whole))
     high = samples.take(window.high, axis)
     high -= low
     high *= part

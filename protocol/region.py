@@ -86,19 +86,26 @@ class Cap(Region):
 
     def sample_area(self, rows: IntArray) -> FloatArray:
         """How large a sample of each row is, 1 on the equator; of rows outside, as large as of the nearest inside."""
-        return self.row_share[np.clip(rows - self.top, 0, self.height - 1)]
+        return self.row_share[self._nearest(rows)]
+
+    def _nearest(self, rows: IntArray) -> IntArray:
+        """Of each of its rows, from 0, the nearest to these. (n,)"""
+        return np.minimum(np.maximum(rows - self.top, 0), self.height - 1)
 
     def inside(self, rows: IntArray, columns: range) -> BoolArray:
         """Which of rows (any) x columns (ascending, not wrapped) lie in it. (rows, columns) bool"""
-        row = np.clip(rows - self.top, 0, self.height - 1)
-        left, width = self.row_left[row], np.where(row == rows - self.top, self.row_width[row], 0)
-        begin = columns[0] - (columns[0] - left) % self.turn  # of the run round the first column, or left of it
-        turns = self.turn * np.arange((columns[-1] - int(begin.min())) // self.turn + 1)
-        runs = begin[:, None, None] + turns[:, None] + np.stack([np.zeros_like(width), width], axis=1)[:, None]
-        edges = np.clip(-((columns[0] - runs) // columns.step), 0, len(columns)).reshape(rows.size, -1)
-        lengths = np.diff(edges, axis=1, prepend=0, append=len(columns)).ravel()
-        inside = np.repeat(np.arange(lengths.size) % (2 * turns.size + 1) % 2 == 1, lengths)
-        return np.asarray(inside.reshape(rows.size, len(columns)))
+        row = self._nearest(rows)
+        width = self.row_width[row] * (row == rows - self.top)
+        ahead = (columns[0] - self.row_left[row]) % self.turn  # how far its run begins before the first column
+        turns = range(0, columns[-1] - columns[0] + int(ahead.max()) + 1, self.turn)
+        edges = np.empty((rows.size, 2 * len(turns) + 2), np.int64)
+        edges[:, 0], edges[:, -1] = 0, len(columns)
+        for place, shift in enumerate(turns):
+            edges[:, 2 * place + 1] = -((ahead - shift) // columns.step)
+            edges[:, 2 * place + 2] = -((ahead - shift - width) // columns.step)
+        within = np.minimum(np.maximum(edges, 0), len(columns))
+        inside = np.tile(np.arange(2 * len(turns) + 1) % 2 == 1, rows.size)
+        return inside.repeat((within[:, 1:] - within[:, :-1]).ravel()).reshape(rows.size, len(columns))
 
     def counts(self, side: int) -> IntArray:
         """How many of its samples lie in each block of `blocks`. (rows, columns) int64, read-only"""

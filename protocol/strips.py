@@ -94,9 +94,12 @@ def samples_of(strips: Strips) -> int:
     return sum(strip.selection.samples for strip in strips)
 
 
+@lru_cache(maxsize=8)
 def blocks_of(strips: Strips) -> IntArray:
-    """Flat indices of the adopted blocks, strip after strip. (n,) int64"""
-    return np.concatenate([np.zeros(0, np.int64), *(strip.selection.adopted_blocks() for strip in strips)])
+    """Flat indices of the adopted blocks, strip after strip. (n,) int64, read-only"""
+    blocks = np.concatenate([np.zeros(0, np.int64), *(strip.selection.adopted_blocks() for strip in strips)])
+    blocks.flags.writeable = False
+    return blocks
 
 
 def image_shapes(strips: Strips, codec: TextureCodec) -> list[tuple[int, int]]:
