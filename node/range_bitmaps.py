@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from node.coded import Coded, Part, own_inside
 from node.library import Scan
 from node.range_model import PERCENTILE
-from node.refine_range import code_range_lattice, note_range, range_lattice
+from node.refine_range import Trial, code_range_lattice, note_range, range_lattice
 from node.state import ClientState
 from protocol.grid import RANGE_BLOCK, VOID, BoolArray, FloatArray
 from protocol.holdings import COARSE_RANK, range_rank
@@ -35,11 +35,18 @@ SLACK = 1e-6  # of sums of areas
 
 
 def reach_range(
-    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, target_steps: float, *, quick: bool = False
+    scan: Scan,
+    state: ClientState,
+    region: Region,
+    wanted: RangeParameters,
+    target_steps: float,
+    *,
+    quick: bool = False,
+    trial: Trial | None = None,
 ) -> list[Coded]:
     """Encode refinements after which the whole region is within target_steps, held blocks included.
 
-    quick : spare time rather than bytes.
+    quick : spare time rather than bytes.   trial : of the spacing wanted, if it was tried.
 
     Blocks held well enough are left out by a bitmap, and so are those held at better values than wanted, since what
     improves them would have to be as good throughout. Where what is kept turns out too poor for this window, it is sent
@@ -54,13 +61,13 @@ def reach_range(
     apart = good | better if better.any() or good[touched].mean() >= LISTED_SHARE else np.zeros_like(good)
     apart |= ~touched
     allowed = _allowed_beyond(scan, region)
-    coded = _code_listed(scan, state, region, wanted, apart, quick)
+    coded = _code_listed(scan, state, region, wanted, apart, quick, trial)
     beyond = _cells_beyond(scan, coded, region, target_steps)
     for _ in range(TRIES_MAX):
         if beyond <= allowed:
             break
         wanted = RangeParameters(p=wanted.p, quantum=max(wanted.quantum * 3 // 4, 1), s=wanted.s)
-        coded = _code_listed(scan, state, region, wanted, apart, quick)
+        coded = _code_listed(scan, state, region, wanted, apart, quick, trial)
         beyond = _cells_beyond(scan, coded, region, target_steps)
     first = [coded] if coded is not None else []
     kept = touched & ~_of_region(_adopted(held.shape, coded), region)
@@ -118,13 +125,19 @@ def _level_at(p: int) -> int:
 
 
 def _code_listed(
-    scan: Scan, state: ClientState, region: Region, wanted: RangeParameters, apart: BoolArray, quick: bool = False
+    scan: Scan,
+    state: ClientState,
+    region: Region,
+    wanted: RangeParameters,
+    apart: BoolArray,
+    quick: bool = False,
+    trial: Trial | None = None,
 ) -> Coded | None:
     """Encode the region's blocks but for those apart."""
     parameters = range_lattice(region, wanted)
     if apart.any():
         parameters = replace(parameters, listed=mask_to_runs(~apart))
-    return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick)
+    return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick, trial=trial)
 
 
 def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:

@@ -94,8 +94,9 @@ class RangeSearch:
         """The refinements after which the window is as good as asked for."""
         self._encodes.add()
         found = reach_range(
-            self._scan, self._state, self._region, wanted, self.target_steps, quick=self._hurried
-        )
+            self._scan, self._state, self._region, wanted, self.target_steps,
+            quick=self._hurried, trial=self._trials.get(wanted.p),
+        )  # fmt: skip
         self._encodes.count += max(len(found) - 1, 0)
         return found
 

@@ -97,13 +97,20 @@ def code_range(
 
 
 def code_range_lattice(
-    scan: Scan, state: ClientState, parameters: Parameters, quantum: int, *, quick: bool = False
+    scan: Scan,
+    state: ClientState,
+    parameters: Parameters,
+    quantum: int,
+    *,
+    quick: bool = False,
+    trial: Trial | None = None,
 ) -> Coded | None:
-    """The same for a lattice that is given."""
+    """The same for a lattice that is given.   trial : of its spacing, whose surveys serve where it was of all this."""
     strips, quantum = select_range_lattice(state, parameters, quantum)
     if not strips:
         return None
-    images = _surveyed(scan, strips, quantum)
+    was_tried = trial is not None and trial.is_of(strips)
+    images = trial.surveys(quantum) if trial is not None and was_tried else _surveyed(scan, strips, quantum)
     voids = [void_cells(scan, strip.selection) for strip in strips]
     parts = tuple(
         Part(strip, mask=encode_mask(void), decoded=image.decoded, void=void)
@@ -171,6 +178,7 @@ class Trial:
     """One spacing over a region: what error a quantum leaves."""
 
     def __init__(self, scan: Scan, strips: Strips, region: Region) -> None:
+        self._strips = strips
         self._parts = [_TrialPart(scan, strip.selection, region) for strip in strips]
         self._errors: dict[int, float] = {}
 
@@ -190,7 +198,18 @@ class Trial:
 
     def expected_bytes(self, quantum: int) -> float:
         """About how many bytes the refinement takes."""
-        return expected_bytes([part.survey(quantum) for part in self._parts])
+        return expected_bytes(self.surveys(quantum))
+
+    def surveys(self, quantum: int) -> list[Survey]:
+        """What its strips would take."""
+        return [part.survey(quantum) for part in self._parts]
+
+    def is_of(self, strips: Strips) -> bool:
+        """Whether these carry what it tried."""
+        return len(strips) == len(self._strips) and all(
+            a.selection.lattice is b.selection.lattice and np.array_equal(a.adopted, b.adopted)
+            for a, b in zip(strips, self._strips, strict=True)
+        )
 
 
 class _TrialPart:

@@ -17,7 +17,7 @@ from protocol.grid import VOID, BoolArray, ImageArray, IntArray, StepArray
 from protocol.lattice import QUARTERS, Axis
 from protocol.reconstruct import Selection, Window, cut, every
 
-FILL_CELL = 4  # texels
+FILL_CELL = 8  # texels: 4 spare 1% of the bytes and take half as long again
 
 
 def range_samples(scan: Scan, selection: Selection) -> tuple[StepArray, BoolArray]:
@@ -111,7 +111,9 @@ def smoothed(texels: ImageArray, seen: BoolArray, cell: int = FILL_CELL) -> Imag
     share[:height, :width] = mask * np.uint8(255)
     total, seen_share = (_shrunk(image, cell).astype(np.float32) for image in (known, share))
     means = np.clip(_means(total, seen_share / np.float32(255)), 0, 255).astype(np.uint8)
-    filled = cv2.resize(means, whole[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
+    alike = max(cell // 2, 1)  # rows: to interpolate each takes twice the time
+    filled = cv2.resize(means, (whole[1], whole[0] // alike), interpolation=cv2.INTER_LINEAR)
+    filled = filled.repeat(alike, axis=0)[:height, :width]
     cv2.copyTo(known[:height, :width], mask, filled)
     return np.asarray(filled, np.uint8)
 
