@@ -32,11 +32,10 @@ SPACINGS: tuple[Literal[1, 2, 4, 8], ...] = (8, 4, 2, 1)
 QUANTUM_MAX = 4096
 FINENESS_COSTS = 0.35  # blocks held at a small quantum can only be made finer at one as small (F-09c)
 TRIES_MAX = 6  # quanta tried at a spacing
-MOST_QUANTUM = 2.05  # of the target: what is tried first
+MOST_QUANTUM = 2.05  # of the target: the largest that is tried
 WELL_WITHIN = 0.75  # of the target: where interpolating leaves no more, no closer spacing takes fewer bytes
 ERROR_A_QUANTUM = 0.46  # at the 99th percentile, at most nearly always
-AIM = 0.985  # of the target: what is interpolated is not met exactly
-FINENESS = 0.1  # of a quantum, to which it is searched
+FINENESS = 0.05  # of a quantum, to which it is searched
 
 
 def choose_range(
@@ -264,24 +263,21 @@ def _largest_quantum(trial: Trial, p: int, target_steps: float) -> int:
     """About the largest quantum that keeps the region's error within target_steps.
 
     Quantising alone leaves half a quantum at most, and nearly that at the 99th percentile; so a little more than twice
-    the target is often right. What interpolating leaves adds to it in squares, but where that is nearly all of it.
+    the target is the most to try. What interpolating leaves adds to it in cubes.
     """
-    guess = max(min(round(MOST_QUANTUM * target_steps), QUANTUM_MAX), 1)
+    most = max(min(round(MOST_QUANTUM * target_steps), QUANTUM_MAX), 1)
     if p == 1:
-        return guess if trial.error(guess) <= target_steps else _always_within(target_steps)
-    low, low_error = 1, trial.error(1)
-    high, high_error = 0, 0.0
-    for tried in range(TRIES_MAX):
-        error = trial.error(guess)
-        if error <= target_steps:
-            low, low_error = guess, error
-        else:
-            high, high_error = guess, error
-        if not high or high - low <= high * FINENESS:
+        return most if trial.error(most) <= target_steps else _always_within(target_steps)
+    low, left, high, growth = 1, trial.error(1), most + 1, ERROR_A_QUANTUM**3
+    for _ in range(TRIES_MAX):
+        room = max(target_steps**3 - left**3, 0.0)
+        guess = min(round((low**3 + room / growth) ** (1 / 3)), high - 1)
+        if guess - low <= low * FINENESS:
             break
-        between = float(low * high)
-        if not tried:
-            share = ((AIM * target_steps) ** 2 - low_error**2) / (high_error**2 - low_error**2)
-            between = low**2 + max(share, 0.0) * (high**2 - low**2)
-        guess = max(round(math.sqrt(between)), low + 1)
+        error = trial.error(guess)
+        growth = max(error**3 - left**3, 1.0) / (guess**3 - low**3)
+        if error <= target_steps:
+            low, left = guess, error
+        else:
+            high = guess
     return low

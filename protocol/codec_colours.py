@@ -30,7 +30,7 @@ _MIDDLE = 1 << 15
 _GREY = 128
 Turn = tuple[int, ...]
 _EVERY = 2  # of an image's rows, with the one below: as many tell its axes, of a large one ...
-_TEXELS = 1 << 16  # ... so many texels
+_TEXELS = 1 << 15  # ... so many texels
 # Colours of Y Cb Cr, and back (ISO/IEC 15444-1 G.3).
 _FROM_YCC = np.array([[1, 0, 1.402], [1, -0.114 * 1.772 / 0.587, -0.299 * 1.402 / 0.587], [1, 1.772, 0]])
 _TO_YCC: FloatArray = np.linalg.inv(_FROM_YCC)

@@ -24,7 +24,7 @@ from protocol.inflate import inflate
 QUANTUM_MAX = 65534
 _ESCAPE = 3
 _BYTE = 255
-_QUICK, _THOROUGH = 6, 12  # levels of libdeflate
+_QUICK, _THOROUGH = 6, 11  # levels of libdeflate; 12 takes 1.7 times as long as 11 for 0.4% fewer bytes
 _WORD_MAX = 4 * STEPS_MAX
 _VALUE_BYTES_MAX, _PADDING_BYTES = 6, 8  # two bits, an escape of one byte, one of four more
 _RUN_MIN, _RUN_MAX = 4, 258  # equal bytes that deflate makes one code of
