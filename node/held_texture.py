@@ -29,6 +29,8 @@ class HeldTexture:
     """What a client held of a region when a look was planned. Arrays are (rows, columns) of Region.blocks.
 
     Blocks whose error was never measured count as the model expects them, or as just good enough without one.
+
+    is_refined : whether it held more than the first view of any.
     """
 
     def __init__(self, state: ClientState, region: Region, model: TextureModel | None, target_mse: float) -> None:
@@ -39,6 +41,7 @@ class HeldTexture:
         self.touched: BoolArray = region.touched(TEXTURE_BLOCK)
         self._level, self._quality = held.level[place].astype(np.int64), held.rank[place].astype(np.int64) - 1
         self._refined = held.rank[place] > COARSE_RANK
+        self.is_refined = bool((self._refined & self.touched).any())
         self._missed = state.missed[place]
         self._model = model
 
@@ -85,6 +88,8 @@ class HeldTexture:
 
     def listed(self, target_mse: float) -> tuple[int, ...] | None:
         """Runs that list the blocks not held well enough; None where nearly all are (F-07b)."""
+        if not self.is_refined:
+            return None
         good = self.touched & self._refined & (self._missed <= target_mse)
         return mask_to_runs(self.touched & ~good) if good[self.touched].mean() >= LISTED_SHARE else None
 

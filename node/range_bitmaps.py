@@ -135,7 +135,7 @@ def _code_listed(
 ) -> Coded | None:
     """Encode the region's blocks but for those apart."""
     parameters = range_lattice(region, wanted)
-    if apart.any():
+    if (apart & region.touched(RANGE_BLOCK)).any():
         parameters = replace(parameters, listed=mask_to_runs(~apart))
     return code_range_lattice(scan, state, parameters, wanted.quantum, quick=quick, trial=trial)
 

@@ -189,6 +189,9 @@ class TextureSearch:
         if self._model is None:
             self._least[p, listed] = self._lowest
             return Expected.generic(self._target_mse, max(self._region.area * GENERIC_BYTES_PER_TEXEL, 64.0))
+        if listed is None and not self._held.is_refined:  # nearly always: then all of it is sent, at any quality
+            self._least[p, listed] = self._lowest
+            return self._place(p).expect(self._held.touched)
         among = self._held.touched if listed is None else self._blocks(listed)
         needed = self._held.quality_needed(p)
         jumps = np.unique(np.clip(needed[among], self._lowest, self._highest)).tolist()
