@@ -212,11 +212,14 @@ def skirt_steps(half_spacing: int, rho: int, coarse_spacing: int, reach: int) ->
     return steps
 
 
+@lru_cache(maxsize=8)
 def runs_to_mask(runs: tuple[int, ...], size: int) -> BoolArray:
-    """Run lengths, False first, to a mask of `size`. Raises LatticeError unless they add up to it."""
+    """Run lengths, False first, to a mask of `size`, read-only. Raises LatticeError unless they add up to it."""
     if any(not 0 <= run <= size for run in runs) or sum(runs) != size:
         raise LatticeError(f"runs must add up to {size} blocks")
-    return np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    mask = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    mask.flags.writeable = False
+    return mask
 
 
 def mask_to_runs(mask: BoolArray) -> tuple[int, ...]:
