@@ -44,6 +44,12 @@ NOTE_SHOWN = """(bar) => new MutationObserver(() => {
 }).observe(bar, { attributes: true })"""
 
 
+CAMERA = "() => new URLSearchParams(location.hash.slice(1)).get('camera')"
+# On a busy machine everything takes longer than half a second: here a press may last, and is a click or a drag as it ends.
+PATIENT = """() => {
+  const wait = setTimeout;
+  window.setTimeout = (work, ms, ...more) => wait(work, ms === 500 ? 1e9 : ms, ...more);
+}"""
 # In which order the page asks, and hears that the pointer was let go.
 NOTE_PRESSES = """() => {
   const [noted, post] = [(window.noted = []), Worker.prototype.postMessage];
@@ -81,6 +87,7 @@ def test_a_press_asks_for_what_its_click_shows(browser: Browser, node: RunningNo
     with blank(browser) as (page, problems):
         said = conversation(page)
         show(page, node.url)
+        page.evaluate(PATIENT)
         page.evaluate(NOTE_PRESSES)
         click(page, 0.5, 0.42)
         wait_updates(page, 1)
@@ -89,11 +96,29 @@ def test_a_press_asks_for_what_its_click_shows(browser: Browser, node: RunningNo
         assert [kind for kind in said if kind in ("look", "cancel")] == ["look"] and problems == []
 
 
+def test_a_hand_that_shakes_moves_no_camera(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        page.wait_for_url("**camera=**")
+        camera = page.evaluate(CAMERA)
+        point_at(page, 0.5, 0.42)
+        page.mouse.down()
+        point_at(page, 0.505, 0.42)
+        page.mouse.up()
+        wait_updates(page, 1)
+        page.wait_for_url("**fovea=**")
+        assert page.evaluate(CAMERA) == camera
+        page.mouse.down()
+        point_at(page, 0.53, 0.42)
+        page.mouse.up()
+        page.wait_for_function(f"(camera) => camera !== ({CAMERA})()", arg=camera)
+
+
 def test_a_press_that_becomes_a_drag_is_no_look(browser: Browser, node: RunningNode) -> None:
     """What it has brought is held and seen; what it has not is called off."""
     with blank(browser) as (page, problems):
         said = conversation(page)
         show(page, node.url)
+        page.evaluate(PATIENT)
         before = crop(page, 0.5, 0.42, 90)
         point_at(page, 0.5, 0.42)
         page.mouse.down()

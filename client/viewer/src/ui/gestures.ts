@@ -52,7 +52,8 @@ export function listen(canvas: HTMLCanvasElement, to: Meanings): void {
   canvas.addEventListener('pointerup', (event) => end(isNear(event) && event.timeStamp - pressed!.timeStamp < CLICK_MS));
   canvas.addEventListener('pointercancel', () => end(false));
   canvas.addEventListener('pointermove', (event) => {
-    if (!isNear(event)) end(false);
+    if (isNear(event)) event.stopPropagation(); // a hand that shakes moves no camera: that would be drawn before what is clicked
+    else end(false);
     if (event.buttons || event.timeStamp - hovered <= HOVER_MS) return;
     hovered = event.timeStamp;
     to.hover(event.clientX, event.clientY);
