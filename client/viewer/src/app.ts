@@ -1,5 +1,6 @@
 // The page: panels, picture and worker, and what passes between them.
 
+import type { WebGLRenderer } from 'three';
 import { deleteScan, deleteSweep, listCutSweeps, listScans, readAccount, readCapture, resumeSweep } from './api.ts';
 import type { Sidecar } from './api.ts';
 import { Comparison } from './comparison.ts';
@@ -62,20 +63,19 @@ export class App {
   private writing: ReturnType<typeof setTimeout> | undefined;
 
   constructor(
-    root: HTMLElement, private readonly worker: Worker, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
-    poster: HTMLImageElement | null, hire: (scan: string) => Worker,
+    root: HTMLElement, private readonly worker: Worker, renderer: WebGLRenderer, poster: HTMLImageElement | null, hire: (scan: string) => Worker,
   ) {
     const say = (text: string) => this.frame.say(text);
     this.frame = new Frame(root, {
       retry: () => this.tell({ kind: 'retry' }), zoom: (steps) => this.pane.stage.zoom(steps), home: () => this.home(),
     });
-    canvas.id = 'view';
+    renderer.domElement.id = 'view';
     const shared = {
       say, options: () => this.look.options, home: () => this.home(), undone: () => this.latest.undo(), changed: () => this.writeState(),
       received: (bytes: number) => this.cost.traffic(bytes), updated: (answer: Answer) => this.cost.answered(answer),
       measured: (measured: Measured) => this.measured(measured), dropped: () => this.comparison.takeBack(),
     };
-    this.pane = new Pane((message) => this.tell(message), canvas, context, {
+    this.pane = new Pane((message) => this.tell(message), renderer, {
       ...shared,
       opened: (info, fresh, framed) => this.opened(info, fresh, framed),
       missing: () => this.missing(),

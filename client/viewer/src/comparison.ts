@@ -8,6 +8,7 @@ import { Pane } from './pane.ts';
 import type { PaneEvents } from './pane.ts';
 import { strings } from './strings.ts';
 import type { Beside } from './url_state.ts';
+import { rendererOf } from './view/renderer.ts';
 import type { Place } from './view/room.ts';
 import type { CameraPlace } from './view/stage.ts';
 
@@ -139,7 +140,7 @@ export class Comparison {
     const context = canvas.getContext('webgl2', CONTEXT);
     if (!context) return null;
     canvas.id = 'view-beside';
-    const pane: Pane = new Pane((message) => this.worker?.postMessage(message), canvas, context, {
+    const pane: Pane = new Pane((message) => this.worker?.postMessage(message), rendererOf(canvas, context), {
       ...this.events,
       opened: (info, _, framed) => this.opened(info.id, framed),
       moved: () => this.moved(pane),

@@ -16,6 +16,7 @@ import { PinsPanel } from './ui/pins_panel.ts';
 import { kindOf, ToolChoice } from './ui/tool_choice.ts';
 import { parseState } from './url_state.ts';
 import type { ViewState } from './url_state.ts';
+import { rendererOf } from './view/renderer.ts';
 
 export class OfflineCopy {
   private readonly held = JSON.parse(textOf(HELD)) as Held;
@@ -37,7 +38,7 @@ export class OfflineCopy {
     this.frame.offline(strings.copy.said(held));
     this.frame.hintAt('turn');
     canvas.id = 'view';
-    this.pane = new Pane(tell, canvas, context, {
+    this.pane = new Pane(tell, rendererOf(canvas, context), {
       say: (text) => this.frame.say(text),
       clicked: (place) => {
         if (place && kindOf(this.tools.tool)) this.pane.measuring.add(place);

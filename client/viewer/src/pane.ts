@@ -1,5 +1,6 @@
 // One picture with one scan in it: shows what the worker says of it, and asks for detail.
 
+import type { WebGLRenderer } from 'three';
 import type { Answer, FromWorker, LookOptions, ToWorker } from './link.ts';
 import { Looks } from './looks.ts';
 import { Measuring } from './measuring.ts';
@@ -67,16 +68,16 @@ export class Pane {
 
   /** noted: where it stands to be read how far things are; its own element, if nothing else. */
   constructor(
-    private readonly tell: (message: ToWorker) => void, canvas: HTMLCanvasElement, context: WebGL2RenderingContext,
-    private readonly events: PaneEvents, noted?: HTMLElement,
+    private readonly tell: (message: ToWorker) => void, renderer: WebGLRenderer, private readonly events: PaneEvents, noted?: HTMLElement,
   ) {
+    const canvas = renderer.domElement;
     const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
     assign(canvas, { tabindex: 0, role: 'application', 'aria-label': strings.view.label });
     this.element = h('div', { class: 'picture' }, canvas);
     this.noted = noted ?? this.element;
     this.pictured = new Promise<void>((resolve) => (this.painted = resolve)).then(() => this.stage.done());
     setTimeout(() => this.painted(), PICTURE_MS);
-    this.stage = new Stage(canvas, context, {
+    this.stage = new Stage(renderer, {
       drawn: () => this.drawn(),
       moved: () => {
         if (this.stage.moving) this.showMeanwhile(null);

@@ -1,6 +1,7 @@
 // The picture: renderer, camera and controls, one surface; drawn only when something has changed.
 
-import { PerspectiveCamera, Scene, Vector3, WebGLRenderer } from 'three';
+import { PerspectiveCamera, Scene, Vector3 } from 'three';
+import type { WebGLRenderer } from 'three';
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
 import type { Snapshot } from '../link.ts';
 import { RANGE } from '../protocol/lattice.ts';
@@ -9,6 +10,7 @@ import type { Changed } from '../protocol/model.ts';
 import { FACING_RAD } from '../facing.ts';
 import { cardIsDone } from './compile.ts';
 import { boundsOf, FIELD_OF_VIEW_DEG, fittingDistance } from './framing.ts';
+import { drawsInSoftware } from './renderer.ts';
 import { geometryOf, isSphere } from './room.ts';
 import type { Geometry, Place } from './room.ts';
 import { within as inside, joined } from './repaint.ts';
@@ -54,7 +56,7 @@ export interface StageEvents {
 export class Stage {
   private readonly software: boolean;
   private readonly detail: Detail;
-  private readonly renderer: WebGLRenderer;
+  private readonly canvas: HTMLCanvasElement;
   private readonly scene = new Scene();
   private readonly camera = new PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 1, 1000);
   private readonly controls: OrbitControls;
@@ -87,15 +89,10 @@ export class Stage {
   private leisure: ReturnType<typeof setTimeout> | undefined;
   private settling: ReturnType<typeof setTimeout> | undefined;
 
-  constructor(
-    private readonly canvas: HTMLCanvasElement, context: WebGL2RenderingContext, private readonly events: StageEvents, calm: boolean,
-  ) {
-    this.renderer = new WebGLRenderer({ canvas, context, alpha: true });
-    this.renderer.debug.checkShaderErrors = false; // asking waits for the compiler
-    this.renderer.sortObjects = false; // it would measure every vertex
-    this.software = drawsInSoftware(context);
+  constructor(private readonly renderer: WebGLRenderer, private readonly events: StageEvents, calm: boolean) {
+    const canvas = (this.canvas = renderer.domElement);
+    this.software = drawsInSoftware(renderer);
     this.detail = this.software ? SOFTWARE : HARDWARE;
-    this.renderer.setClearColor(0, 0);
     this.controls = new OrbitControls(this.camera, canvas);
     this.sight = new Sight(canvas, this.camera, () => this.surface);
     Object.assign(this.controls, { enableDamping: !calm, dampingFactor: 0.12, zoomToCursor: true, rotateSpeed: 0.7 });
@@ -399,13 +396,6 @@ export class Stage {
 
 /** An elevation that leaves no doubt which way is up. */
 const within = (elevation: number): number => Math.min(Math.max(elevation, -ELEVATION_MAX_RAD), ELEVATION_MAX_RAD);
-
-/** Whether the processor draws, because there is no graphics card. */
-function drawsInSoftware(context: WebGL2RenderingContext): boolean {
-  const named = context.getExtension('WEBGL_debug_renderer_info');
-  const name = String(context.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : context.RENDERER));
-  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
-}
 
 /** The smallest scan, as coarse as a first view. */
 function nothing(geometry: Geometry): Snapshot {
