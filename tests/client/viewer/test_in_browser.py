@@ -45,7 +45,7 @@ NOTE_SHOWN = """(bar) => new MutationObserver(() => {
 
 
 CAMERA = "() => new URLSearchParams(location.hash.slice(1)).get('camera')"
-# On a busy machine everything takes longer than half a second: here a press may last, and is a click or a drag as it ends.
+# On a busy machine all takes longer than half a second: here a press may last, and is a click or a drag as it ends.
 PATIENT = """() => {
   const wait = setTimeout;
   window.setTimeout = (work, ms, ...more) => wait(work, ms === 500 ? 1e9 : ms, ...more);
