@@ -14,10 +14,10 @@ from node.classic_planner import ClassicUpdate, plan_classic
 from node.coded import Coded, Packed
 from node.foveate import Planned, Update, plan_update
 from node.library import Scan
-from node.range_model import RangeModel
 from node.refine_texture import mse_of_db
 from node.state import ClientState
 from node.texture_model import TextureModel
+from node.wanted import Models, Wanted
 from protocol import messages as m
 from protocol.codec import JPEG_QUALITY_MAX, TextureCodec
 from protocol.errors import LatticeError, RemoteWireError
@@ -43,38 +43,34 @@ class Bound:
 
     def plan(
         self,
-        look: m.Look,
-        codecs: Sequence[m.CodecName],
-        budget_bytes: int | None,
+        wanted: Wanted,
+        models: Models,
         superseded: Callable[[], bool],
-        model: TextureModel | None,
-        quick: bool,
-        range_model: RangeModel | None = None,
-        hurried: bool = False,
         pool: Executor | None = None,
         ready: Callable[[Sequence[Coded]], None] | None = None,
     ) -> Update | ClassicUpdate:
-        """The update that answers a look; arguments as for plan_update. codecs : what the client takes, best first.
+        """The update that answers a look; arguments as for plan_update, but that the best of the codecs is chosen.
 
         Raises LatticeError or CodecError where the look does not fit the scan or its opening.
         """
+        look, codecs = wanted.look, wanted.codecs
         is_classic = isinstance(self.state, ClassicState)
         if is_classic != (look.profile == "classic"):
             raise LatticeError(f"the scan is not open with the {look.profile} profile")
         if isinstance(self.state, ClassicState):
-            return plan_classic(self.scan, self.state, look, budget_bytes, superseded)
-        spares_time = hurried and quick and model is not None and "jpeg" in codecs  # and bytes are to be had
-        codec = choose_codec(("jpeg", *codecs) if spares_time else codecs, self.scan, look, model)
-        plan = partial(
-            plan_update, self.scan, self.state, look, budget_bytes=budget_bytes, superseded=superseded, model=model,
-            quick=quick, range_model=range_model, hurried=hurried, pool=pool,
-        )  # fmt: skip
+            return plan_classic(self.scan, self.state, look, wanted.budget_bytes, superseded)
+        spares_time = wanted.hurried and wanted.quick and "jpeg" in codecs  # and bytes are to be had
+        liked = ("jpeg", *codecs) if spares_time and models.texture is not None else codecs
+        codec = choose_codec(liked, self.scan, look, models.texture)
+
+        of_codec = replace(wanted, codecs=(codec,))
+        plan = partial(plan_update, self.scan, self.state, models=models, superseded=superseded, pool=pool)
         if codec == "htj2k" or "htj2k" not in codecs:
-            return plan(codec, ready=ready)
-        update = plan(codec)
+            return plan(of_codec, ready=ready)
+        update = plan(of_codec)
         if not _falls_short(update, look):
             return update
-        better = plan("htj2k")
+        better = plan(replace(wanted, codecs=("htj2k",)))
         return replace(better, encodes=update.encodes + better.encodes)
 
     def begin(self, coded: Sequence[Coded], look: m.Look) -> list[bytes]:

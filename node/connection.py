@@ -1,4 +1,4 @@
-"""One client's stream: reads what it asks, plans the newest look, sends one update at a time.
+"""One client's stream: reads what it asks, answers the newest look, one update at a time.
 
 Three tasks share a connection. The reader takes messages as they come and never waits for anything slow; the sender
 opens scans and answers looks, one update unacknowledged at a time. A newer look supersedes one that is not sent yet.
@@ -12,29 +12,25 @@ import logging
 import re
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
-from node.ahead import Ahead
+from node.answer import Answer
 from node.audit import Audit, Who
 from node.auth import Login
-from node.bound import AnyUpdate, Bound, updated
+from node.bound import AnyUpdate, Bound
 from node.bucket import Bucket
-from node.coded import Coded
 from node.exhibits import Exhibits
-from node.foveate import Update
 from node.live import Live, Place
 from node.metrics import Metrics
-from node.rate import RateControl, Sending
+from node.outbox import Outbox
 from protocol import messages as m
 from protocol.errors import CodecError, LatticeError, LibraryError, RemoteWireError
 from protocol.grid import Geometry
-from protocol.live import LiveColumns
 from protocol.session import Phase, Role, Session
 
 log = logging.getLogger(__name__)
@@ -43,7 +39,6 @@ OPENS_MAX = 4
 HELLO_S = 10.0
 ACK_S = 60.0
 CLOSE_S = 2.0
-QUICK_BYTES_S = 50e6 / 8  # on faster links time counts more than bytes
 CLOSE_REASON_MAX = 120  # of 123 bytes
 QUOTED = re.compile("""['"].*['"]""", re.DOTALL)  # what a client said is told to it alone: it may be about a patient
 
@@ -82,7 +77,7 @@ class Connection:
         self._live_news = asyncio.Event()
         self._info = house.info
         self._session = Session(Role.NODE)
-        self._rate = RateControl(house.cold_start_bytes_s)
+        self._outbox = Outbox(socket, self._session, house.metrics, house.cold_start_bytes_s)
         self._messages = Bucket(house.messages_s, time.monotonic())
         self._codecs: tuple[m.CodecName, ...] = ("htj2k",)
         self._geometries: tuple[Geometry, ...] = ()
@@ -91,16 +86,14 @@ class Connection:
         self._epoch = 0
         self._opens: deque[m.Open] = deque()
         self._look: m.Look | None = None
-        self._running_look: m.Look | None = None
+        self._running: Answer | None = None
         self._gave_way = False
         self._news: deque[m.Published] = deque(maxlen=16)
         self._work = asyncio.Event()
-        self._acknowledged = asyncio.Event()
-        self._sending = Sending(time.monotonic())
 
     async def run(self) -> None:
         """Serve until the client goes. Never raises for what the client does."""
-        await self._send(self._info)
+        await self._outbox.send(self._info)
         try:
             if not await self._let_in():
                 return
@@ -142,7 +135,7 @@ class Connection:
         """Say goodbye and end the stream."""
         if self._session.phase is Phase.READY:
             with suppress(ConnectionError):  # gone already
-                await self._send(m.Goodbye(reason))
+                await self._outbox.send(m.Goodbye(reason))
         await self._socket.close(code=code, message=_cut(reason))
 
     # -- reading ---------------------------------------------------------------------------------------------------
@@ -154,11 +147,11 @@ class Connection:
             return False
         assert isinstance(message, m.Hello)  # the session lets nothing else through
         if message.protocol != m.PROTOCOL:
-            await self._send(m.Refused(0, "bad request", f"this node speaks {m.PROTOCOL}"))
+            await self._outbox.send(m.Refused(0, "bad request", f"this node speaks {m.PROTOCOL}"))
             return False
         self._codecs, self._geometries = message.codecs, message.geometries
         assert self.login.role is not None and self.login.role != "monitor"  # Auth.admit lets nobody else come here
-        await self._send(m.Welcome(self.login.role))
+        await self._outbox.send(m.Welcome(self.login.role))
         return True
 
     async def _read(self) -> None:
@@ -166,7 +159,7 @@ class Connection:
             match message:
                 case m.Open():
                     if len(self._opens) >= OPENS_MAX:
-                        await self._send(m.Refused(message.request, "busy", "too many scans are being opened"))
+                        await self._outbox.send(m.Refused(message.request, "busy", "too many scans are being opened"))
                     else:
                         self._opens.append(message)
                         self._work.set()
@@ -179,7 +172,7 @@ class Connection:
                 case m.State():
                     await self._take_state(message)
                 case m.Envelope():
-                    await self._send(await self._enveloped(message.request))
+                    await self._outbox.send(await self._enveloped(message.request))
                 case m.Watch(live=live):
                     self._place = Place() if live else None
                     if live:
@@ -222,35 +215,33 @@ class Connection:
 
     async def _take_look(self, look: m.Look) -> None:
         if self._look is not None:
-            await self._send(self._superseded(self._look))
+            await self._outbox.send(self._superseded(self._look))
         self._look = look
         self._work.set()
 
     async def _forget(self, request: int) -> None:
         if self._look is not None and self._look.request == request:
             look, self._look = self._look, None
-            await self._send(self._superseded(look))
-        if self._running_look is not None and self._running_look.request == request:
-            self._running_look = None
+            await self._outbox.send(self._superseded(look))
+        if self._running is not None and self._running.look.request == request:
+            self._running.is_wanted = False
 
     async def _take_ack(self, ack: m.Ack) -> None:
         bound = self._bound
         if bound is None or ack.epoch != bound.epoch or ack.next_seq != bound.next_seq:
             return  # of an update that a newer opening has overtaken
-        if not self._acknowledged.is_set() and (fastest := self._sending.fastest(time.monotonic())):
-            self._rate.acknowledged(*fastest, ack.apply_ms / 1000)
-            self._metrics.measured(self._rate.bandwidth_bytes_s)
+        self._outbox.acknowledged(ack.apply_ms / 1000)
         if ack.digest != bound.state.holdings.digest():
-            await self._send(m.Resync(bound.epoch, "digests differ"))
+            await self._outbox.send(m.Resync(bound.epoch, "digests differ"))
             return
-        self._acknowledged.set()
+        self._outbox.is_free.set()
 
     async def _take_state(self, said: m.State) -> None:
         bound = self._bound
         if bound is None or said.epoch != bound.epoch:
             return
         bound.adopt_word(said)
-        self._acknowledged.set()
+        self._outbox.is_free.set()
 
     # -- answering -------------------------------------------------------------------------------------------------
 
@@ -259,7 +250,7 @@ class Connection:
             await self._work.wait()
             self._work.clear()
             while self._news:
-                await self._send(self._news.popleft())
+                await self._outbox.send(self._news.popleft())
             while self._opens:
                 await self._open(self._opens.popleft())
             if self._look is not None:
@@ -271,7 +262,7 @@ class Connection:
     async def _await_ack(self) -> None:
         if self._bound is not None:
             async with _patience(ACK_S, "ack"):
-                await self._acknowledged.wait()
+                await self._outbox.is_free.wait()
 
     async def _open(self, wanted: m.Open) -> None:
         try:
@@ -284,121 +275,63 @@ class Connection:
             if wanted.holdings is not None:
                 bound.adopt_holdings(wanted.holdings)
         except LibraryError as error:
-            await self._send(m.Refused(wanted.request, "not found", str(error)[:500]))
+            await self._outbox.send(m.Refused(wanted.request, "not found", str(error)[:500]))
             return
         self._bound = bound
         self._audit.note("opened", self._who, scan=scan.id)
         self._metrics.opened()
-        self._acknowledged.clear()
-        await self._send(m.Opened(wanted.request, bound.epoch, view.info))
+        self._outbox.is_free.clear()
+        await self._outbox.send(m.Opened(wanted.request, bound.epoch, view.info))
         if wanted.holdings is not None:
-            self._acknowledged.set()
+            self._outbox.is_free.set()
             return
         bound.next_seq = 2
-        self._sending = Sending(time.monotonic())
+        self._outbox.begin()
         for refinement in view.refinements(bound.epoch):
-            await self._send_bytes(refinement)
+            await self._outbox.send_bytes(refinement)
 
     async def _answer_look(self) -> None:
         """When it is our turn among all streams, plan what is the newest look by then; send what comes of it."""
         started_s = time.monotonic()
         async with self._exhibits.turn() as is_pressing:
-            bound, look, self._look = self._bound, self._look, None
+            look, self._look, bound = self._look, None, self._bound
             if look is None:  # cancelled while it waited
                 return
-            answer = await self._planned(bound, look, is_pressing)
-        if isinstance(answer, m.Refused | m.Updated):
-            await self._send(answer)
-            return
-        assert bound is not None  # else it was refused
-        spent_s = time.monotonic() - started_s
-        self._rate.encoded(spent_s)
-        await self._send_update(bound, look, answer, spent_s)
-
-    async def _planned(
-        self, bound: Bound | None, look: m.Look, hurried: bool
-    ) -> AnyUpdate | m.Refused | m.Updated:
-        """What answers a look, or what is said instead."""
+            if bound is not None:
+                answer = Answer(look, bound, self._outbox, self._exhibits, self._metrics, self._is_overtaken)
+                planned = await self._planned(answer, is_pressing)
         if bound is None:
             why = "the scan was deleted: open another" if self._is_gone else "open a scan first"
-            return m.Refused(look.request, "not open", why)
-        self._running_look, state = look, bound.state
+            await self._outbox.send(m.Refused(look.request, "not open", why))
+        elif isinstance(planned, m.Refused | m.Updated):
+            await self._outbox.send(planned)
+        else:
+            spent_s = time.monotonic() - started_s
+            self._outbox.rate.encoded(spent_s)
+            await answer.send(planned, spent_s)
+
+    async def _planned(self, answer: Answer, hurried: bool) -> AnyUpdate | m.Refused | m.Updated:
+        """What answers a look, or what is said instead."""
+        self._running = answer
         try:
-            update = await self._plan(bound, look, hurried)
+            update = await answer.plan(self._codecs, hurried)
         except (LatticeError, CodecError) as error:
-            await self._call_off(bound)
-            return m.Refused(look.request, "bad request", str(error)[:500])
+            return m.Refused(answer.look.request, "bad request", str(error)[:500])
         finally:
-            still_wanted, self._running_look = self._running_look is look or bound.begun > 0, None
-        if bound.state is not state:  # the client has objected to what came ahead
-            bound.begun, still_wanted = 0, False
+            self._running = None
         self._gave_way = update.reason == "superseded"
-        return self._superseded(look) if self._gave_way or not still_wanted else update
+        return self._superseded(answer.look) if self._gave_way or not answer.is_wanted else update
 
-    async def _plan(self, bound: Bound, look: m.Look, hurried: bool) -> AnyUpdate:
-        budget = look.max_bytes
-        if look.max_wait_s is not None:
-            affordable = self._rate.budget_bytes(look.max_wait_s)
-            budget = affordable if budget is None else min(budget, affordable)
+    def _is_overtaken(self) -> bool:
+        """A newer look stops one, but no two in a row: who clicks faster than we plan gets something, too."""
+        return self._look is not None and not self._gave_way
 
-        def superseded() -> bool:
-            """A newer look stops this one, but no two in a row: who clicks faster than we plan gets something, too."""
-            return self._running_look is not look or (self._look is not None and not self._gave_way)
+    def _superseded(self, look: m.Look) -> m.Updated:
+        self._metrics.updated("superseded")
+        next_seq = self._bound.next_seq if self._bound else 0
+        return m.Updated(look.request, next_seq, "superseded")
 
-        models = self._exhibits.texture_model(bound.scan), self._exhibits.range_model(bound.scan)
-        quick = self._rate.bandwidth_bytes_s > QUICK_BYTES_S
-        if hurried:
-            self._metrics.hurried()
-        pool = None if hurried else self._exhibits.idle_pool()
-        ahead = Ahead(superseded)
-
-        def job() -> AnyUpdate:
-            update = bound.plan(
-                look, self._codecs, budget, ahead.superseded, models[0], quick, models[1], hurried, pool,
-                None if pool is None else ahead.send,
-            )  # fmt: skip
-            return update.settled() if pool is None and isinstance(update, Update) else update
-
-        def elsewhere() -> AnyUpdate | None:
-            return self._exhibits.planners.plan(
-                bound, look, self._codecs, budget, superseded, models[0], quick, models[1], hurried
-            )
-
-        planning = asyncio.ensure_future(self._exhibits.work(job, "look", None if pool else elsewhere))
-        try:
-            either: set[asyncio.Future[Any]] = {planning, ahead.first}
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-            if ahead.first.done():
-                await self._send_ahead(bound, look, ahead.first.result())
-            return await planning
-        finally:
-            planning.cancel()
-
-    async def _send_ahead(self, bound: Bound, look: m.Look, coded: Sequence[Coded]) -> None:
-        """Send what an update begins with while the rest is planned."""
-        self._acknowledged.clear()
-        self._sending = Sending(time.monotonic())
-        for refinement in bound.begin(coded, look):
-            await self._send_bytes(refinement)
-
-    async def _call_off(self, bound: Bound) -> None:
-        """There is no end of an update that was begun: the client shall say what it holds."""
-        if bound.begun:
-            bound.begun = 0
-            await self._send(m.Resync(bound.epoch, "an update could not be ended"))
-
-    async def _send_update(self, bound: Bound, look: m.Look, update: AnyUpdate, spent_s: float) -> None:
-        if bound.begun:
-            self._sending.goes_on(time.monotonic())
-        elif update.coded:
-            self._acknowledged.clear()
-            self._sending = Sending(time.monotonic())
-        for refinement in bound.take(update, look):  # counts all of them at once, as what is said meanwhile must
-            await self._send_bytes(refinement)
-        if isinstance(update, Update) and update.settle is not None:
-            update = await self._exhibits.work(update.settled)
-        self._metrics.updated(update.reason)
-        await self._send(updated(look, bound.next_seq, update, spent_s))
+    # -- a sweep that runs -----------------------------------------------------------------------------------------
 
     async def _show_live(self) -> None:
         """Send what is new in the running sweep, as long as the client watches."""
@@ -407,28 +340,7 @@ class Connection:
             self._live_news.clear()
             while (place := self._place) is not None and (news := self._live.next(place)):
                 for said in news:
-                    await self._send(said)
-
-    # -- writing ---------------------------------------------------------------------------------------------------
-
-    async def _send(self, said: m.FromNode | LiveColumns) -> None:
-        if self._session.phase is Phase.CLOSED:
-            return  # we have said goodbye: nobody waits for this any more
-        wire = self._session.send(said)
-        if isinstance(wire, str):
-            await self._socket.send_str(wire)
-        else:
-            await self._send_bytes(wire)
-
-    async def _send_bytes(self, data: bytes) -> None:
-        self._sending.sent(len(data))
-        self._metrics.sent(len(data))
-        await self._socket.send_bytes(data)
-
-    def _superseded(self, look: m.Look) -> m.Updated:
-        self._metrics.updated("superseded")
-        next_seq = self._bound.next_seq if self._bound else 0
-        return m.Updated(look.request, next_seq, "superseded")
+                    await self._outbox.send(said)
 
     async def _turn_away(self, why: str, code: WSCloseCode) -> None:
         log.warning("stream ended: %s", QUOTED.sub("...", why))

@@ -23,6 +23,7 @@ from node.planners import Planners
 from node.range_model import RangeModel
 from node.right_of_way import RightOfWay
 from node.texture_model import TextureModel
+from node.wanted import NO_MODELS, Models
 from protocol.errors import LibraryError
 from protocol.messages import CodecName, Profile
 
@@ -103,13 +104,12 @@ class Exhibits:
             self._pictures.pop(key, None)
             raise
 
-    def texture_model(self, scan: Scan) -> TextureModel | None:
-        """What the scan's texture takes and reaches; None until that is measured."""
-        return _done(self._models[scan.id][1]) if scan.id in self._models else None
-
-    def range_model(self, scan: Scan) -> RangeModel | None:
-        """What interpolating the scan's range misses; None until that is measured."""
-        return _done(self._models[scan.id][0]) if scan.id in self._models else None
+    def models(self, scan: Scan) -> Models:
+        """What was measured of the scan by now."""
+        if scan.id not in self._models:
+            return NO_MODELS
+        of_range, of_texture = self._models[scan.id]
+        return Models(_done(of_range), _done(of_texture))
 
     @property
     def surveying(self) -> int:

@@ -21,18 +21,15 @@ from node.beside import both
 from node.coded import Coded, Packed, framed
 from node.library import Scan
 from node.quality import Encodes, Superseded
-from node.range_model import RangeModel
 from node.range_search import RangeSearch
 from node.refine_range import code_range, settle_range
 from node.refine_texture import code_texture, db_of_mse, mse_of_db, select_texture, settle_texture
 from node.state import ClientState
-from node.texture_model import TextureModel
 from node.texture_search import TextureSearch
+from node.wanted import NO_MODELS, Models, Wanted
 from protocol.grid import RANGE_BLOCK
 from protocol.lattice import Channel
 from protocol.messages import (
-    CodecName,
-    Look,
     LookParameters,
     RangeParameters,
     TextureParameters,
@@ -105,30 +102,20 @@ class Planned:
 def plan_update(
     scan: Scan,
     state: ClientState,
-    look: Look,
-    codec: CodecName,
-    budget_bytes: int | None = None,
+    wanted: Wanted,
+    models: Models = NO_MODELS,
     superseded: Callable[[], bool] = lambda: False,
-    model: TextureModel | None = None,
-    quick: bool = False,
-    range_model: RangeModel | None = None,
-    hurried: bool = False,
     pool: Executor | None = None,
     ready: Callable[[Sequence[Coded]], None] | None = None,
 ) -> Update:
-    """Plan the update that answers a look.
+    """Plan the update that answers a look, its texture by the first of the codecs.
 
-    codec : the texture codec for this client.   budget_bytes : what the update may take; None for no limit.
     superseded : asked between encodes; when true, what is planned so far is dropped.
-    model : what the scan's texture takes, where that is known by now.   quick : spare time rather than bytes.
-    range_model : what its range misses, likewise.   hurried : others wait, so spare what a few percent of bytes buy.
     pool : a free thread of it plans range meanwhile, where that does not depend on what texture takes.
     ready : told the refinements of range, with which the update begins, as soon as these are there in that case.
     Raises LatticeError or CodecError where explicit parameters do not fit the scan.
     """
-    planner = _Planner(
-        scan, state.copy(), look, codec, budget_bytes, superseded, model, quick, range_model, hurried, pool, ready
-    )
+    planner = _Planner(scan, state.copy(), wanted, models, superseded, pool, ready)
     try:
         planner.run()
     except Superseded:
@@ -143,18 +130,14 @@ class _Planner:
         self,
         scan: Scan,
         state: ClientState,
-        look: Look,
-        codec: CodecName,
-        budget_bytes: int | None,
+        wanted: Wanted,
+        models: Models,
         superseded: Callable[[], bool],
-        model: TextureModel | None,
-        quick: bool,
-        range_model: RangeModel | None,
-        hurried: bool,
         pool: Executor | None,
         ready: Callable[[Sequence[Coded]], None] | None,
     ) -> None:
-        self._scan, self._state, self._look, self._codec, self._quick = scan, state, look, codec, quick
+        look, codec, budget_bytes, hurried = wanted.look, wanted.codecs[0], wanted.budget_bytes, wanted.hurried
+        self._scan, self._state, self._look, self._codec, self._quick = scan, state, look, codec, wanted.quick
         self._pool, self._ready = pool, ready
         self._left = math.inf if budget_bytes is None else float(budget_bytes - REPLY_BYTES)
         self._spare = 0.0 if budget_bytes is None else (1 - FILL) * budget_bytes
@@ -164,11 +147,12 @@ class _Planner:
         self._window = look.window if look.scale is None else look.scale**2
         self._range_region, self._texture_region = self._regions(self._window)
         self._range = RangeSearch(
-            scan, state, look, self._range_region, range_model, hurried, self._encodes[Channel.RANGE]
+            scan, state, look, self._range_region, models.range, hurried, self._encodes[Channel.RANGE]
         )
         self._texture = TextureSearch(
-            scan, state, look, self._texture_region, codec, model, quick, hurried, self._encodes[Channel.TEXTURE]
-        )
+            scan, state, look, self._texture_region, codec, models.texture, wanted.quick, hurried,
+            self._encodes[Channel.TEXTURE],
+        )  # fmt: skip
 
     def _regions(self, window: float) -> tuple[Region, Region]:
         """What a share of the area round the click is of range and of texture."""

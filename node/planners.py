@@ -26,12 +26,10 @@ from typing import Any
 
 from node.bound import Bound
 from node.foveate import Planned
-from node.planning_process import Ask, Forget, Key, Parcel, ScanParts, Stop, Wanted
-from node.range_model import RangeModel
+from node.planning_process import Ask, Forget, Key, Parcel, ScanParts, Stop, Task
 from node.state import ClientState
-from node.texture_model import TextureModel
 from node.tray import Tray
-from protocol import messages as m
+from node.wanted import Models, Wanted
 from protocol.errors import FoveascanError
 
 log = logging.getLogger(__name__)
@@ -59,31 +57,25 @@ class Planners:
     def plan(
         self,
         bound: Bound,
-        look: m.Look,
-        codecs: Sequence[m.CodecName],
-        budget_bytes: int | None,
+        wanted: Wanted,
+        models: Models,
         superseded: Callable[[], bool],
-        model: TextureModel | None,
-        quick: bool,
-        range_model: RangeModel | None,
-        hurried: bool,
     ) -> Planned | None:
         """The update that answers a look, settled; arguments as for Bound.plan. None: plan it yourself.
 
         Raises LatticeError or CodecError as that does.
         """
         state = bound.state
-        if not isinstance(state, ClientState) or look.profile == "classic" or (planner := self._claim()) is None:
+        if not isinstance(state, ClientState) or wanted.look.profile == "classic":
+            return None
+        if (planner := self._claim()) is None:
             return None
         try:
             if not planner.is_up():
                 return None
-            planner.hand(self._needed(bound, model, range_model))
-            wanted = Wanted(
-                bound.scan.id, range_model is not None, model is not None, state, look, tuple(codecs),
-                budget_bytes, quick, hurried,
-            )  # fmt: skip
-            return planner.answer(wanted, superseded)
+            planner.hand(self._needed(bound, models))
+            known = models.range is not None, models.texture is not None
+            return planner.answer(Task(bound.scan.id, *known, state, wanted), superseded)
         except (OSError, EOFError) as error:
             if not self._is_over:
                 planner.bury(str(error))
@@ -142,14 +134,14 @@ class Planners:
                 planner.tidy(self._parcels.keys())
                 self._free.append(planner)
 
-    def _needed(self, bound: Bound, model: TextureModel | None, range_model: RangeModel | None) -> list[_Sent]:
+    def _needed(self, bound: Bound, models: Models) -> list[_Sent]:
         """The parcels of a look, made when they are first needed."""
         scan = bound.scan
         contents: dict[Key, Callable[[], object]] = {("scan", scan.id): lambda: ScanParts.of(scan, self._library)}
-        if range_model is not None:
-            contents["range model", scan.id] = lambda: range_model
-        if model is not None:
-            contents["texture model", scan.id] = lambda: model
+        if models.range is not None:
+            contents["range model", scan.id] = lambda: models.range
+        if models.texture is not None:
+            contents["texture model", scan.id] = lambda: models.texture
         with self._lock:
             for key, content in contents.items():
                 if key not in self._parcels:
@@ -215,12 +207,12 @@ class _Planner:
                 send_handle(self._line, sent.tray.file, self._process.pid)
                 self._has.add(sent.parcel.key)
 
-    def answer(self, wanted: Wanted, superseded: Callable[[], bool]) -> Planned | None:
+    def answer(self, task: Task, superseded: Callable[[], bool]) -> Planned | None:
         """What it makes of a look. Raises what it raises, OSError and EOFError when it died or does not answer."""
         assert self._line is not None and self._tray is not None
         self._number += 1
         until_s, is_told = time.monotonic() + PATIENCE_S, False
-        self._line.send(Ask(self._number, self._tray.lay(wanted)))
+        self._line.send(Ask(self._number, self._tray.lay(task)))
         while not self._line.poll(SUPERSEDED_S):
             if time.monotonic() > until_s:
                 raise TimeoutError(f"it did not answer within {PATIENCE_S:g} s")
@@ -232,7 +224,7 @@ class _Planner:
             raise answer
         if not isinstance(answer, Planned):
             return None
-        state = replace(answer.state, shapes=wanted.state.shapes, first_error=wanted.state.first_error)
+        state = replace(answer.state, shapes=task.state.shapes, first_error=task.state.first_error)
         return replace(answer, state=state)  # what never changes is shared with other streams
 
     def tidy(self, needed: Collection[Key]) -> None:

@@ -26,7 +26,7 @@ from node.library import Scan
 from node.scan_folder import About, read_grid
 from node.state import ClientState
 from node.tray import Laid, Tray, end_of
-from protocol import messages as m
+from node.wanted import Models, Wanted
 from protocol.errors import CodecError, LatticeError, LibraryError
 from protocol.grid import GridSpec, ImageArray, StepArray
 
@@ -52,18 +52,14 @@ class Forget:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """A look to plan; arguments as for node.bound.Bound.plan, its models as parcels that have come."""
+class Task:
+    """A look to plan, and over what: the scan and its models are parcels that have come."""
 
     scan_id: str
     has_range_model: bool
     has_texture_model: bool
     state: ClientState
-    look: m.Look
-    codecs: tuple[m.CodecName, ...]
-    budget_bytes: int | None
-    quick: bool
-    hurried: bool
+    wanted: Wanted
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +67,7 @@ class Ask:
     """Answer a Wanted that lies in the tray. number : by which it may be stopped."""
 
     number: int
-    wanted: Laid
+    task: Laid
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +124,9 @@ class PlanningProcess:
                 case Forget(keys=keys):
                     for key in keys:
                         self._has.pop(key, None)
-                case Ask(number=number, wanted=wanted):
-                    answer = self._answer(self._tray.take(wanted, copied=False), self._stopped(number))
-                    self._line.send(self._tray.lay(answer, end_of(wanted)))
+                case Ask(number=number, task=task):
+                    answer = self._answer(self._tray.take(task, copied=False), self._stopped(number))
+                    self._line.send(self._tray.lay(answer, end_of(task)))
 
     def _keep(self, key: Key, value: Any) -> None:
         with suppress(LibraryError):  # it was deleted meanwhile: its looks are answered by None
@@ -141,17 +137,16 @@ class PlanningProcess:
         said = self._line.recv()
         return (said, Tray(recv_handle(self._line)).take(said.laid, copied=False)) if isinstance(said, Parcel) else said
 
-    def _answer(self, wanted: Wanted, stopped: Callable[[], bool]) -> Planned | LatticeError | CodecError | None:
-        scan_id = wanted.scan_id
+    def _answer(self, task: Task, stopped: Callable[[], bool]) -> Planned | LatticeError | CodecError | None:
+        scan_id = task.scan_id
         if ("scan", scan_id) not in self._has:
             return None
-        texture_model = self._has["texture model", scan_id] if wanted.has_texture_model else None
-        range_model = self._has["range model", scan_id] if wanted.has_range_model else None
+        models = Models(
+            self._has["range model", scan_id] if task.has_range_model else None,
+            self._has["texture model", scan_id] if task.has_texture_model else None,
+        )
         try:
-            update = Bound(0, self._has["scan", scan_id], wanted.state).plan(
-                wanted.look, wanted.codecs, wanted.budget_bytes, stopped, texture_model, wanted.quick, range_model,
-                wanted.hurried,
-            )  # fmt: skip
+            update = Bound(0, self._has["scan", scan_id], task.state).plan(task.wanted, models, stopped)
         except (LatticeError, CodecError) as error:
             return error
         assert isinstance(update, Update)  # classic looks are planned elsewhere

@@ -39,6 +39,7 @@ from node.proxy import IS_PROXIED
 from node.refine_range import code_range_lattice
 from node.refine_texture import code_texture_lattice
 from node.rest import query_of
+from node.wanted import Models, Wanted
 from protocol import messages as m
 from protocol.codec import SIXTEENTHS, TextureCodec
 from protocol.errors import CodecError, LatticeError, LibraryError
@@ -143,8 +144,8 @@ class SharedFoveae:
         raise web.HTTPSeeOther(place)
 
     async def _make_plan(self, scan: Scan, view: FirstView, look: m.Look, codec: m.CodecName) -> str:
-        model = self._exhibits.texture_model(scan)
-        job = partial(plan_update, scan, view.state, look, codec, look.max_bytes, lambda: False, model)
+        models = Models(texture=self._exhibits.models(scan).texture)
+        job = partial(plan_update, scan, view.state, Wanted(look, (codec,), look.max_bytes), models)
         update = await self._exhibits.work(job, "fovea")
         place = canonical_path(scan.id, self._epoch, update.coded)
         self.encodes += 1

@@ -20,6 +20,7 @@ from node.foveate import plan_update
 from node.library import Scan
 from node.refine_texture import code_texture, measured
 from node.texture_model import TextureModel
+from node.wanted import Models, Wanted
 from protocol.grid import ImageArray
 from protocol.lattice import Channel
 from protocol.messages import CodecName, Look, TextureParameters
@@ -70,15 +71,15 @@ def _click(
 ) -> list[dict[str, Any]]:
     target = Target()
     window = Window.round(scan.grid, click, target)
-    seen = texture_as_seen(view)
+    seen, models = texture_as_seen(view), Models(texture=model)
     look = Look(1, *click, target.window, texture_db=target.texture_db, range_mm=target.range_mm)
-    free = plan_update(published, view.state, look, codec, model=model)
+    free = plan_update(published, view.state, Wanted(look, (codec,)), models)
     if all(coded.channel is Channel.RANGE for coded in free.coded):
         return []  # the first view shows enough: no texture to compare
     rows, tries = [], _fixed_tries(published, view, look, codec, window, seen)
     for share in SHARES:
         limit = round(share * free.wire_bytes)
-        ours = plan_update(published, view.state, look, codec, limit, model=model)
+        ours = plan_update(published, view.state, Wanted(look, (codec,), limit), models)
         texture = [coded for coded in ours.coded if coded.channel is Channel.TEXTURE]
         left = limit - ours.wire_bytes + sum(coded.wire_bytes for coded in texture)
         held_db = psnr_db(crop(seen, window.texture), window.texels)

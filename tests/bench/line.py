@@ -27,6 +27,7 @@ from node.refine_texture import texture_lattice
 from node.resampling import Encoder
 from node.sample import texture_samples
 from node.texture_model import TextureModel
+from node.wanted import Models, Wanted
 from protocol.codec import JPEG_QUALITY_MIN, jpeg_q
 from protocol.framing import USB_PAYLOAD_MAX, Frame, FrameReader, encode_frame
 from protocol.grid import Grid, ImageArray
@@ -185,11 +186,12 @@ def update(scan: Scan, case: Case, click: tuple[float, float], repeats: int) -> 
 def searched(published: Scan, scan: BenchScan, clicks: int) -> dict[str, Any]:
     """How many images the node encodes when it chooses the parameters itself."""
     encodes: dict[str, list[int]] = {}
-    model = TextureModel(published.texture)
+    model = Models(texture=TextureModel(published.texture))
     for codec in CODECS:
         view = build_first_view(published, codec, FIRST_VIEW_BYTES)
         looks = [Look(1, u, v, WINDOW) for u, v in scan.clicks(clicks)]
-        encodes[codec] = [plan_update(published, view.state, look, codec, model=model).encodes for look in looks]
+        wanted = [Wanted(look, (codec,)) for look in looks]
+        encodes[codec] = [plan_update(published, view.state, each, model).encodes for each in wanted]
     return {f"encodes_{codec}": counts for codec, counts in encodes.items()}
 
 
@@ -256,7 +258,7 @@ def _fresh(model: Model) -> Model:
 
 
 def _plan(scan: Scan, view: FirstView, look: Look, case: Case) -> tuple[Update, list[Refinement]]:
-    planned = plan_update(scan, view.state, look, case.codec, quick=case.quick, pool=THREADS)
+    planned = plan_update(scan, view.state, Wanted(look, (case.codec,), quick=case.quick), pool=THREADS)
     refinements = [coded.refinement(1, seq + 2, look.request) for seq, coded in enumerate(planned.coded)]
     for refinement in refinements:
         refinement.to_bytes()

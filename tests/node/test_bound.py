@@ -14,6 +14,7 @@ from node.foveate import Update
 from node.library import Scan
 from node.state import ClientState
 from node.texture_model import TextureModel
+from node.wanted import NO_MODELS, Models, Wanted
 from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.lattice import Channel
@@ -58,7 +59,7 @@ def test_a_look_gets_what_it_asks_for_whatever_the_client_likes_best(
 ) -> None:
     bound = Bound(1, scan, build_first_view(scan, "jpeg", 32768).state, 2)
     look = m.Look(2, 0.75, 0.5, texture_db=texture_db)
-    update = bound.plan(look, BOTH, None, lambda: False, model if is_measured else None, False)
+    update = bound.plan(Wanted(look, BOTH), Models(texture=model if is_measured else None), lambda: False)
     assert isinstance(update, Update)
     assert {coded.codec for coded in update.coded if coded.channel is Channel.TEXTURE} == {codec}
     assert update.texture_db is not None and update.texture_db >= texture_db
@@ -78,7 +79,8 @@ def test_in_a_hurry_a_fast_link_gets_jpeg_where_that_does(
 ) -> None:
     bound = Bound(1, scan, build_first_view(scan, "htj2k", 32768).state, 2)
     look = m.Look(2, 0.75, 0.5, texture_db=texture_db)
-    update = bound.plan(look, ("htj2k", "jpeg"), None, lambda: False, model, quick, hurried=hurried)
+    wanted = Wanted(look, ("htj2k", "jpeg"), quick=quick, hurried=hurried)
+    update = bound.plan(wanted, Models(texture=model), lambda: False)
     assert isinstance(update, Update)
     assert {coded.codec for coded in update.coded if coded.channel is Channel.TEXTURE} == {codec}
     assert update.texture_db is not None and update.texture_db >= texture_db
@@ -86,7 +88,7 @@ def test_in_a_hurry_a_fast_link_gets_jpeg_where_that_does(
 
 def test_who_takes_jpeg_only_gets_its_best(scan: Scan) -> None:
     bound = Bound(1, scan, build_first_view(scan, "jpeg", 32768).state, 2)
-    update = bound.plan(HARD, ("jpeg",), None, lambda: False, None, False)
+    update = bound.plan(Wanted(HARD, ("jpeg",)), NO_MODELS, lambda: False)
     assert isinstance(update, Update) and update.texture_db is not None
     assert {coded.codec for coded in update.coded if coded.channel is Channel.TEXTURE} == {TextureCodec.JPEG}
     assert 34 < update.texture_db < HARD.texture_db

@@ -21,6 +21,7 @@ from node.bound import Bound
 from node.library import About, Library
 from node.serve import HEARTBEAT_S
 from node.texture_search import TextureSearch
+from node.wanted import Models, Wanted
 from protocol import messages as m
 from protocol.codec import TextureCodec
 from protocol.errors import CodecError
@@ -83,11 +84,11 @@ async def test_who_clicks_faster_than_the_node_plans_is_answered(
 ) -> None:
     plan = Bound.plan
 
-    def slowly(self: Bound, look: m.Look, codecs: Any, budget: Any, superseded: Callable[[], bool], *more: Any) -> Any:
+    def slowly(self: Bound, wanted: Wanted, models: Models, superseded: Callable[[], bool], *more: Any) -> Any:
         until_s = time.monotonic() + 0.2
         while time.monotonic() < until_s and not superseded():
             time.sleep(0.002)
-        return plan(self, look, codecs, budget, superseded, *more)
+        return plan(self, wanted, models, superseded, *more)
 
     monkeypatch.setattr(Bound, "plan", slowly)
     stream, answer = await opened(node)

@@ -18,7 +18,6 @@ from node import derive
 from node.bodies import Derivation
 from node.durable import NoRoom
 from node.first_view import build_first_view, texture_as_seen
-from node.foveate import plan_update
 from node.library import About, Library, content_id
 from node.serve import NodeServer
 from node.texture_model import TextureModel
@@ -29,6 +28,7 @@ from simulators.pebble import pebble
 from simulators.shapes import cylinder, sphere
 from tests.exchange.grids import vase
 from tests.exchange.tipped import lying, swept
+from tests.node.planning import plan_look
 from tests.node.served import Client, served
 
 SHAPE = (96, 80, 96, 64)
@@ -109,7 +109,7 @@ def test_where_no_error_is_left_a_byte_limit_is_no_reason_to_fail(tmp_path: Path
     view = build_first_view(ball, "htj2k", 32768)
     model = TextureModel(ball.texture, texture_as_seen(view))
     look = Look(1, 0, 0, scale=5e-324, texture_db=10, range_mm=0)
-    assert plan_update(ball, view.state, look, "htj2k", 1 << 40, model=model).reason == "complete"
+    assert plan_look(ball, view.state, look, "htj2k", 1 << 40, model=model).reason == "complete"
 
 
 @pytest.mark.parametrize(

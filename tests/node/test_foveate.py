@@ -22,6 +22,7 @@ from node.library import Scan
 from node.range_model import RangeModel
 from node.state import ClientState
 from node.texture_model import TextureModel
+from node.wanted import Wanted
 from protocol import messages as m
 from protocol.grid import VOID, Grid
 from protocol.lattice import Channel
@@ -29,6 +30,7 @@ from protocol.messages import Look, LookParameters, RangeParameters, TexturePara
 from protocol.refinement import Refinement
 from protocol.region import region_round
 from simulators.specimen import make_specimen
+from tests.node.planning import plan_look
 from tests.node.scans import keep, make_grid
 
 CLICKS = [(0.1, 0.5), (0.62, 0.3), (0.99, 0.02), (0.4, 0.98)]
@@ -103,7 +105,7 @@ def test_reaches_the_quality_asked_for(
     viewer = Viewer(scan, view)
     look = Look(1, u, v, texture_db=34, range_mm=0.05)
     model = None if pace == "unknown" else RangeModel(scan.spec, scan.range_steps, scan.filled)
-    update = plan_update(scan, viewer.state, look, codec, range_model=model, hurried=pace == "hurried")
+    update = plan_look(scan, viewer.state, look, codec, range_model=model, hurried=pace == "hurried")
     viewer.take(update)
     assert update.reason == "complete"
     assert viewer.range_error_mm(look) <= look.range_mm
@@ -117,7 +119,7 @@ def test_everything_there_is_can_be_asked_for(
 ) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, 0.7, 0.5, texture_db=100, range_mm=0)
-    update = plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture if known else None)
+    update = plan_look(scan, viewer.state, look, model=model_of_texture if known else None)
     viewer.take(update)
     assert update.texture_db is not None and update.texture_db >= 55  # the codec's best, on noise
     assert viewer.range_error_mm(look) == 0
@@ -128,7 +130,7 @@ def test_a_window_may_touch_every_block_without_being_all_round(tmp_path: Path, 
     scan = keep(make_grid(48, 32), tmp_path)  # of three blocks round, so that a run of 37 touches all
     viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
     look = Look(1, u, 0.5, window)
-    viewer.take(plan_update(scan, viewer.state, look, "htj2k"))
+    viewer.take(plan_look(scan, viewer.state, look))
     assert viewer.range_error_mm(look) <= look.range_mm
 
 
@@ -136,7 +138,7 @@ def test_a_window_may_touch_every_block_without_being_all_round(tmp_path: Path, 
 def test_a_second_thread_changes_nothing(scan: Scan, view: FirstView, explicit: bool) -> None:
     look = Look(1, 0.62, 0.3, parameters=EXACT if explicit else None)
     with ThreadPoolExecutor(1) as pool:
-        alone, beside = (plan_update(scan, view.state, look, "htj2k", pool=each) for each in (None, pool))
+        alone, beside = (plan_update(scan, view.state, Wanted(look, ("htj2k",)), pool=each) for each in (None, pool))
     assert [coded.payload for coded in beside.coded] == [coded.payload for coded in alone.coded]
     assert (beside.reason, beside.encodes, beside.texture_db) == (alone.reason, alone.encodes, alone.texture_db)
     assert beside.settled().state.holdings.digest() == alone.settled().state.holdings.digest()
@@ -145,7 +147,7 @@ def test_a_second_thread_changes_nothing(scan: Scan, view: FirstView, explicit: 
 def test_range_is_told_before_the_update_that_begins_with_it(scan: Scan, view: FirstView) -> None:
     told: list[Sequence[Coded]] = []
     with ThreadPoolExecutor(1) as pool:
-        update = plan_update(scan, view.state, Look(1, 0.62, 0.3), "htj2k", pool=pool, ready=told.append)
+        update = plan_update(scan, view.state, Wanted(Look(1, 0.62, 0.3), ("htj2k",)), pool=pool, ready=told.append)
     ((*first,),) = told
     assert first and all(coded.channel is Channel.RANGE for coded in first)
     assert update.coded[: len(first)] == tuple(first)
@@ -154,7 +156,7 @@ def test_range_is_told_before_the_update_that_begins_with_it(scan: Scan, view: F
 def test_says_the_largest_error_left_in_the_window(scan: Scan, view: FirstView) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, 0.62, 0.3)
-    update = plan_update(scan, viewer.state, look, "htj2k").settled()
+    update = plan_look(scan, viewer.state, look).settled()
     viewer.take(update)
     s = scan.spec
     region = region_round(look.u, look.v, look.window, s.width, s.height)
@@ -171,7 +173,7 @@ def test_never_a_byte_over_the_budget(
 ) -> None:  # fmt: skip
     viewer = Viewer(scan, view)
     model = model_of_texture if known else None
-    update = plan_update(scan, viewer.state, Look(1, u, v), codec, budget, model=model)
+    update = plan_look(scan, viewer.state, Look(1, u, v), codec, budget, model=model)
     if update.coded:
         assert viewer.take(update) + REPLY_BYTES <= budget
     else:
@@ -183,7 +185,7 @@ def test_more_bytes_never_make_it_worse(scan: Scan, view: FirstView, model_of_te
     reached = []
     for budget in (1200, 2500, 5000, 10000, 20000):
         viewer = Viewer(scan, view)
-        viewer.take(plan_update(scan, viewer.state, look, "htj2k", budget, model=model_of_texture))
+        viewer.take(plan_look(scan, viewer.state, look, "htj2k", budget, model=model_of_texture))
         reached.append((viewer.texture_db(look), -viewer.range_error_mm(look)))
     for worse, better in zip(reached, reached[1:], strict=False):
         assert better[0] >= worse[0] - 0.5
@@ -199,9 +201,9 @@ def test_a_limit_is_filled_in_few_encodes(
     view = build_first_view(scan, codec, 32768)
     encodes = []
     for u, v in ((0.25, 0.5), (0.5, 0.4), (0.75, 0.6)):
-        free = plan_update(scan, view.state, Look(1, u, v), codec, model=model)
+        free = plan_look(scan, view.state, Look(1, u, v), codec, model=model)
         budget = round(share * free.wire_bytes)
-        update = plan_update(scan, view.state, Look(1, u, v), codec, budget, model=model)
+        update = plan_look(scan, view.state, Look(1, u, v), codec, budget, model=model)
         assert update.reason == "byte limit"
         assert 0.85 * budget <= update.wire_bytes <= budget
         encodes.append(update.encodes)
@@ -216,7 +218,7 @@ def test_texture_is_never_made_worse(head: tuple[Scan, TextureModel]) -> None:
         before = Viewer(scan, view).texture_db(look)
         for budget in (500, 700, 1000, 1400, 2000):
             viewer = Viewer(scan, view)
-            viewer.take(plan_update(scan, viewer.state, look, "htj2k", budget, model=model))
+            viewer.take(plan_look(scan, viewer.state, look, "htj2k", budget, model=model))
             assert viewer.texture_db(look) >= before
 
 
@@ -238,7 +240,7 @@ def test_what_is_known_of_range_spares_trials_and_a_hurry_spares_more(
     paces: tuple[dict[str, Any], ...] = {}, {"range_model": known}, {"range_model": known, "hurried": True}
     for pace in paces:
         trials.clear()
-        updates = [plan_update(scan, state, Look(1, u, 0.5), "htj2k", model=model, **pace) for u in TURN]
+        updates = [plan_look(scan, state, Look(1, u, 0.5), model=model, **pace) for u in TURN]
         counted.append(len(trials))
         size_bytes.append(sum(update.wire_bytes for update in updates))
     free, spared, hurried = counted
@@ -250,8 +252,8 @@ def test_what_is_known_of_range_spares_trials_and_a_hurry_spares_more(
 def test_the_same_look_twice_sends_nothing(scan: Scan, view: FirstView) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, 0.3, 0.4, parameters=EXACT)
-    viewer.take(plan_update(scan, viewer.state, look, "htj2k"))
-    again = plan_update(scan, viewer.state, look, "htj2k")
+    viewer.take(plan_look(scan, viewer.state, look))
+    again = plan_look(scan, viewer.state, look)
     assert again.coded == ()
     assert again.reason == "complete"
 
@@ -260,29 +262,29 @@ def test_looks_all_over_end_with_the_exact_scan(scan: Scan, view: FirstView) -> 
     viewer = Viewer(scan, view)
     for u in np.arange(0.05, 1, 0.1):
         for v in np.arange(0.05, 1, 0.1):
-            viewer.take(plan_update(scan, viewer.state, Look(1, float(u), float(v)), "htj2k"))
-            viewer.take(plan_update(scan, viewer.state, Look(1, float(u), float(v), parameters=EXACT), "htj2k"))
+            viewer.take(plan_look(scan, viewer.state, Look(1, float(u), float(v))))
+            viewer.take(plan_look(scan, viewer.state, Look(1, float(u), float(v), parameters=EXACT)))
     np.testing.assert_array_equal(viewer.model.range_steps, scan.range_steps)
     np.testing.assert_array_equal(viewer.model.texture, scan.texture)
     assert not viewer.state.error.any()
 
 
 def test_a_superseded_plan_is_dropped(scan: Scan, view: FirstView) -> None:
-    update = plan_update(scan, view.state, Look(1, 0.5, 0.5), "htj2k", None, lambda: True)
+    update = plan_update(scan, view.state, Wanted(Look(1, 0.5, 0.5), ("htj2k",)), superseded=lambda: True)
     assert (update.reason, update.coded) == ("superseded", ())
     assert update.state is view.state
 
 
 def test_planning_leaves_the_state_it_was_given(scan: Scan, view: FirstView) -> None:
     before = view.state.copy()
-    plan_update(scan, view.state, Look(1, 0.5, 0.5), "htj2k")
+    plan_look(scan, view.state, Look(1, 0.5, 0.5))
     assert view.state.holdings.digest() == before.holdings.digest()
     np.testing.assert_array_equal(view.state.error, before.error)
 
 
 def test_few_encodes_once_the_texture_is_known(scan: Scan, view: FirstView, model_of_texture: TextureModel) -> None:
     encodes = [
-        plan_update(scan, view.state, Look(1, u, v), "htj2k", model=model_of_texture).encodes for u, v in CLICKS
+        plan_look(scan, view.state, Look(1, u, v), model=model_of_texture).encodes for u, v in CLICKS
     ]
     assert np.mean(encodes) <= 3
     assert max(encodes) <= 4
@@ -294,7 +296,7 @@ def test_odd_scans_are_served(tmp_path: Path, shape: tuple[int, int]) -> None:
     grid = make_grid(width, height, texels=2, voids=False)
     scan = keep(grid, tmp_path)
     viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
-    viewer.take(plan_update(scan, viewer.state, Look(1, 0.5, 0.5), "htj2k"))
+    viewer.take(plan_look(scan, viewer.state, Look(1, 0.5, 0.5)))
 
 
 def test_a_scan_that_is_all_void_is_served(tmp_path: Path) -> None:
@@ -302,7 +304,7 @@ def test_a_scan_that_is_all_void_is_served(tmp_path: Path) -> None:
     void = type(grid)(grid.spec, np.zeros_like(grid.range_steps), grid.texture)
     scan = keep(void, tmp_path)
     viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
-    viewer.take(plan_update(scan, viewer.state, Look(1, 0.5, 0.5), "htj2k"))
+    viewer.take(plan_look(scan, viewer.state, Look(1, 0.5, 0.5)))
     assert not viewer.model.range_steps.any()
 
 
@@ -311,12 +313,12 @@ def test_a_click_on_a_void_is_served(scan: Scan, view: FirstView, budget: int | 
     row, column = np.argwhere(scan.range_steps == VOID)[0]
     viewer = Viewer(scan, view)
     look = Look(1, (column + 0.5) / scan.spec.width, (row + 0.5) / scan.spec.height)
-    viewer.take(plan_update(scan, viewer.state, look, "htj2k", budget))
+    viewer.take(plan_look(scan, viewer.state, look, "htj2k", budget))
     assert budget or viewer.range_error_mm(look) <= look.range_mm
 
 
 def test_parameters_that_do_not_fit_a_limit_are_not_sent(scan: Scan, view: FirstView) -> None:
-    update = plan_update(scan, view.state, Look(1, 0.5, 0.5, parameters=EXACT), "htj2k", 800)
+    update = plan_look(scan, view.state, Look(1, 0.5, 0.5, parameters=EXACT), "htj2k", 800)
     assert (update.reason, update.wire_bytes <= 800) == ("byte limit", True)
     assert Channel.TEXTURE not in {coded.channel for coded in update.coded}
 
@@ -331,9 +333,9 @@ def test_first_view_fits_and_is_the_same_for_the_node(scan: Scan) -> None:
 
 
 def test_alpha_widens_the_skirt_and_scale_the_window(scan: Scan, view: FirstView) -> None:
-    narrow = plan_update(scan, view.state, Look(1, 0.5, 0.5), "htj2k")
-    soft = plan_update(scan, view.state, Look(1, 0.5, 0.5, alpha=0.05), "htj2k")
-    wide = plan_update(scan, view.state, Look(1, 0.5, 0.5, scale=0.5), "htj2k")
+    narrow = plan_look(scan, view.state, Look(1, 0.5, 0.5))
+    soft = plan_look(scan, view.state, Look(1, 0.5, 0.5, alpha=0.05))
+    wide = plan_look(scan, view.state, Look(1, 0.5, 0.5, scale=0.5))
     assert soft.coded[0].parameters.rho_x < narrow.coded[0].parameters.rho_x
     assert sum(p.strip.adopted.sum() for c in soft.coded for p in c.parts) > sum(
         p.strip.adopted.sum() for c in narrow.coded for p in c.parts
@@ -343,8 +345,8 @@ def test_alpha_widens_the_skirt_and_scale_the_window(scan: Scan, view: FirstView
 
 def test_fill_spends_the_rest_on_the_periphery(scan: Scan, view: FirstView, model_of_texture: TextureModel) -> None:
     budget = 60_000
-    plain = plan_update(scan, view.state, Look(1, 0.7, 0.5), "htj2k", budget, model=model_of_texture)
-    filled = plan_update(scan, view.state, Look(1, 0.7, 0.5, fill=True), "htj2k", budget, model=model_of_texture)
+    plain = plan_look(scan, view.state, Look(1, 0.7, 0.5), "htj2k", budget, model=model_of_texture)
+    filled = plan_look(scan, view.state, Look(1, 0.7, 0.5, fill=True), "htj2k", budget, model=model_of_texture)
     assert plain.wire_bytes < filled.wire_bytes <= budget
     levels = [update.state.holdings.channels[Channel.TEXTURE].level for update in (plain, filled)]
     assert (levels[1] <= levels[0]).all()
@@ -353,9 +355,9 @@ def test_fill_spends_the_rest_on_the_periphery(scan: Scan, view: FirstView, mode
 
 def test_a_click_beside_a_held_window_costs_what_is_new(scan: Scan, view: FirstView) -> None:
     viewer = Viewer(scan, view)
-    whole = plan_update(scan, viewer.state, Look(1, 0.75, 0.5), "htj2k").wire_bytes
-    viewer.take(plan_update(scan, viewer.state, Look(1, 0.65, 0.5), "htj2k"))
-    rest = plan_update(scan, viewer.state, Look(1, 0.75, 0.5), "htj2k")
+    whole = plan_look(scan, viewer.state, Look(1, 0.75, 0.5)).wire_bytes
+    viewer.take(plan_look(scan, viewer.state, Look(1, 0.65, 0.5)))
+    rest = plan_look(scan, viewer.state, Look(1, 0.75, 0.5))
     viewer.take(rest)
     assert rest.wire_bytes < 0.75 * whole
 
@@ -369,7 +371,7 @@ def test_overlapping_windows_reach_their_quality_too(
     viewer = Viewer(scan, view)
     for u, v, range_mm in looks:
         look = Look(1, u, v, texture_db=36, range_mm=range_mm)
-        viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture))
+        viewer.take(plan_look(scan, viewer.state, look, model=model_of_texture))
         assert viewer.range_error_mm(look) <= range_mm
         assert viewer.texture_db(look) >= look.texture_db - 0.01
 
@@ -385,7 +387,7 @@ def test_cells_kept_and_cells_mended_share_one_allowance(tmp_path: Path) -> None
     viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
     for u, v in ((0.796, 0.912), (0.873, 0.985)):
         look = Look(1, u, v, texture_db=5, range_mm=0.3)
-        viewer.take(plan_update(scan, viewer.state, look, "htj2k"))
+        viewer.take(plan_look(scan, viewer.state, look))
         assert viewer.range_error_mm(look) <= look.range_mm
 
 
@@ -397,7 +399,7 @@ def test_a_texture_of_one_colour_is_served(tmp_path: Path, codec: m.CodecName, s
     viewer = Viewer(scan, build_first_view(scan, codec, 32768))
     for model in (None, TextureModel(scan.texture)):
         look = Look(1, 0.5, 0.5)
-        viewer.take(plan_update(scan, viewer.state, look, codec, model=model))
+        viewer.take(plan_look(scan, viewer.state, look, codec, model=model))
         assert viewer.texture_db(look) >= 40
 
 
@@ -408,7 +410,7 @@ def test_noise_reaches_the_quality_asked_for(tmp_path: Path, target_db: float) -
     scan = keep(Grid(grid.spec, grid.range_steps, noise), tmp_path)
     viewer = Viewer(scan, build_first_view(scan, "htj2k", 32768))
     look = Look(1, 0.5, 0.5, texture_db=target_db)
-    viewer.take(plan_update(scan, viewer.state, look, "htj2k", model=TextureModel(scan.texture)))
+    viewer.take(plan_look(scan, viewer.state, look, model=TextureModel(scan.texture)))
     assert viewer.texture_db(look) >= target_db - 0.01
 
 
@@ -417,21 +419,21 @@ def test_texture_that_the_first_view_shows_well_enough_is_not_sent(
 ) -> None:
     viewer = Viewer(scan, view)
     look = Look(1, 0.2, 0.5, texture_db=30)
-    update = plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture)
+    update = plan_look(scan, viewer.state, look, model=model_of_texture)
     assert [coded.channel for coded in update.coded] == [Channel.RANGE]
     assert update.texture_db == pytest.approx(viewer.texture_db(look), abs=0.3)
     assert viewer.texture_db(look) >= look.texture_db
-    assert plan_update(scan, viewer.state, look, "htj2k").coded[-1].channel is Channel.TEXTURE  # not known yet: sent
+    assert plan_look(scan, viewer.state, look).coded[-1].channel is Channel.TEXTURE  # not known yet: sent
 
 
 def test_a_window_a_little_further_on_costs_what_is_new_in_it(
     scan: Scan, view: FirstView, model_of_texture: TextureModel
 ) -> None:
     viewer = Viewer(scan, view)
-    first = plan_update(scan, viewer.state, Look(1, 0.7, 0.5), "htj2k", model=model_of_texture)
+    first = plan_look(scan, viewer.state, Look(1, 0.7, 0.5), model=model_of_texture)
     viewer.take(first)
     look = Look(1, 0.7 + 16 / 640, 0.5)
-    second = plan_update(scan, viewer.state, look, "htj2k", model=model_of_texture)
+    second = plan_look(scan, viewer.state, look, model=model_of_texture)
     viewer.take(second)
     assert second.wire_bytes < 0.5 * first.wire_bytes
     assert viewer.range_error_mm(look) <= look.range_mm

@@ -30,6 +30,7 @@ from node.range_model import RangeModel
 from node.sealing import seal
 from node.texture_model import TextureModel
 from node.tray import Tray
+from node.wanted import NO_MODELS, Models, Wanted
 from protocol import messages as m
 from protocol.errors import LatticeError
 from tests.node.scans import make_grid
@@ -43,6 +44,11 @@ ROOT = Path(__file__).parents[2]
 
 def never() -> bool:
     return False
+
+
+def hurried(look: m.Look) -> Wanted:
+    """A look that is planned while others wait."""
+    return Wanted(look, CODECS, hurried=True)
 
 
 class Node:
@@ -66,11 +72,11 @@ class Node:
 
     def ask(self, look: m.Look = LOOK, superseded: Callable[[], bool] = never) -> Planned | None:
         """What the process makes of a look over the first view."""
-        return self.planners.plan(self.bound(), look, CODECS, None, superseded, None, False, None, True)
+        return self.planners.plan(self.bound(), hurried(look), NO_MODELS, superseded)
 
     def plan(self) -> Update:
         """The same as the node does it."""
-        update = self.bound().plan(LOOK, CODECS, None, never, None, False, None, True)
+        update = self.bound().plan(hurried(LOOK), NO_MODELS, never)
         assert isinstance(update, Update)
         return update.settled()
 
@@ -126,8 +132,8 @@ def assert_same(planned: Planned | None, update: AnyUpdate) -> None:
 
 def test_a_process_answers_as_the_node_itself(node: Node) -> None:
     scan = node.scan
-    models = TextureModel(scan.texture), RangeModel(scan.spec, scan.range_steps, scan.filled)
-    for look, knows, quick, hurried in [
+    models = Models(RangeModel(scan.spec, scan.range_steps, scan.filled), TextureModel(scan.texture))
+    for look, knows, quick, in_a_hurry in [
         (LOOK, True, False, True),
         (LOOK, False, False, True),
         (LOOK, True, True, True),
@@ -137,10 +143,10 @@ def test_a_process_answers_as_the_node_itself(node: Node) -> None:
         (m.Look(5, 0.5, 0.5, parameters=m.LookParameters(m.RangeParameters(1, 1))), True, False, True),
     ]:
         node.planners.forget(node.scan.id)  # its model learns: both begin with a new one
-        there, here = (copy.deepcopy(models) if knows else (None, None) for _ in range(2))
-        bound, budget = node.bound(), look.max_bytes
-        planned = node.planners.plan(bound, look, CODECS, budget, never, there[0], quick, there[1], hurried)
-        update = bound.plan(look, CODECS, budget, never, here[0], quick, here[1], hurried)
+        there, here = (copy.deepcopy(models) if knows else NO_MODELS for _ in range(2))
+        bound, wanted = node.bound(), Wanted(look, CODECS, look.max_bytes, quick, in_a_hurry)
+        planned = node.planners.plan(bound, wanted, there, never)
+        update = bound.plan(wanted, here, never)
         assert isinstance(update, Update)
         assert_same(planned, update.settled())
 
@@ -148,10 +154,10 @@ def test_a_process_answers_as_the_node_itself(node: Node) -> None:
 def test_an_update_is_planned_over_what_the_client_holds(node: Node) -> None:
     bound = node.bound()
     ask = node.planners.plan
-    planned = ask(bound, LOOK, CODECS, None, never, None, False, None, True)
+    planned = ask(bound, hurried(LOOK), NO_MODELS, never)
     assert planned is not None and len(bound.take(planned, LOOK)) == 2
     assert bound.state is planned.state and bound.next_seq == 4
-    again = ask(bound, LOOK, CODECS, None, never, None, False, None, True)
+    again = ask(bound, hurried(LOOK), NO_MODELS, never)
     assert again is not None and not again.coded and again.reason == "complete"
 
 
@@ -184,7 +190,7 @@ def test_a_process_that_hears_of_a_newer_look_drops_the_older() -> None:
 
 def test_a_classic_look_is_planned_elsewhere(node: Node) -> None:
     bound = Bound(1, node.scan, build_classic_view(node.scan, "htj2k").state, 2)
-    assert node.planners.plan(bound, LOOK, CODECS, None, never, None, False, None, True) is None
+    assert node.planners.plan(bound, hurried(LOOK), NO_MODELS, never) is None
 
 
 def test_a_process_killed_in_mid_look_is_replaced(node: Node) -> None:

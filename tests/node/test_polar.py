@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from client.model import Model
 from node.first_view import FirstView, build_first_view, texture_as_seen
-from node.foveate import plan_update
 from node.library import Scan
 from node.polar import FARTHEST_RAD, PolarTexture, polar_samples, reaches
 from node.refine_texture import Compared
@@ -27,6 +26,7 @@ from protocol.region import Cap
 from protocol.rings import thin_grid, thin_texture
 from protocol.sphere import DirectionGrid, cap_region, vectors
 from protocol.strips import Strips, build_strips, image_shapes, samples_of, select_strips, texture_patches
+from tests.node.planning import plan_look
 from tests.node.scans import keep
 
 SHAPE = ChannelShape(Channel.TEXTURE, 512, 256, 64, 32, True)
@@ -179,7 +179,7 @@ def test_a_look_near_a_pole_takes_one_image_and_reaches_its_quality(
     client = Model(view.info)
     for data in view.refinements(1):
         client.apply(Refinement.from_bytes(data))
-    update = plan_update(scan, view.state, Look(1, 0.3, v, window=0.05, texture_db=40), codec, model=model).settled()
+    update = plan_look(scan, view.state, Look(1, 0.3, v, window=0.05, texture_db=40), codec, model=model).settled()
     (coded,) = (one for one in update.coded if one.channel is Channel.TEXTURE)
     assert coded.parameters.polar and len(coded.strips) > 1
     for seq, one in enumerate(update.coded, 2):

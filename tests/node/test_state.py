@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from node.first_view import build_first_view
-from node.foveate import plan_update
 from node.library import Scan
 from node.state import ClientState
 from protocol.holdings import ChannelHoldings
@@ -13,6 +12,7 @@ from protocol.lattice import Channel
 from protocol.messages import Look, LookParameters, RangeParameters
 from protocol.reconstruct import paste
 from protocol.region import region_round
+from tests.node.planning import plan_look
 
 
 def restated(state: ClientState, level: int | None = None, rank: int = 65534) -> ClientState:
@@ -28,7 +28,7 @@ def restated(state: ClientState, level: int | None = None, rank: int = 65534) ->
 def test_a_client_that_holds_what_we_thought_changes_nothing(scan: Scan) -> None:
     first = build_first_view(scan, "htj2k", 32768).state
     look = Look(1, 0.5, 0.5, parameters=LookParameters(RangeParameters(2, 9)))
-    after = plan_update(scan, first, look, "htj2k").settled().state
+    after = plan_look(scan, first, look).settled().state
     same = restated(after)
     np.testing.assert_array_equal(same.error, after.error)
     np.testing.assert_array_equal(same.far, after.far)
@@ -39,7 +39,7 @@ def test_a_client_that_holds_what_we_thought_changes_nothing(scan: Scan) -> None
 
 def test_whoever_says_to_have_everything_is_told_that_nothing_is_left(scan: Scan) -> None:
     state = restated(build_first_view(scan, "htj2k", 32768).state, level=0)
-    update = plan_update(scan, state, Look(1, 0.5, 0.5, parameters=LookParameters(RangeParameters(1, 1))), "htj2k")
+    update = plan_look(scan, state, Look(1, 0.5, 0.5, parameters=LookParameters(RangeParameters(1, 1))))
     assert update.coded == ()
     assert update.error_max_mm == 0
 
@@ -55,7 +55,7 @@ def test_what_is_held_in_a_way_unknown_to_us_is_sent_again_where_it_matters(scan
 def test_cells_beyond_are_counted_as_they_are(scan: Scan) -> None:
     first = build_first_view(scan, "htj2k", 32768).state
     look = Look(1, 0.52, 0.47, range_mm=0.02, parameters=LookParameters(RangeParameters(4, 9)))
-    update = plan_update(scan, first, look, "htj2k").settled()
+    update = plan_look(scan, first, look).settled()
     (coded,) = update.coded
     region = region_round(0.5, 0.5, 0.02, scan.spec.width, scan.spec.height)
     (part,) = coded.parts
