@@ -55,6 +55,7 @@ export class OfflineCopy {
       pressed: nothing, dropped: nothing, hovered: nothing, moved: nothing, changed: nothing, updated: nothing, received: nothing, missing: nothing,
     }, document.documentElement);
     this.display = new DisplayPanel(() => this.pane.stage.setLook(this.display.shading, this.display.overlay), held.shading, held.overlay);
+    this.pane.stage.setLook(held.shading, held.overlay);
     const pins = new PinsPanel(nothing, nothing, (pin) => this.pane.stage.face(pin));
     pins.allow(false);
     pins.show(view.pins, true);

@@ -31,6 +31,12 @@ export function gridMesh(
   return mesh;
 }
 
+/** Draw a surface with what it holds laid over it, or without: by a program of its own, since a processor would take that way for nothing. */
+export function overlay({ material }: GridMesh, sphere: boolean, overlaid: boolean): void {
+  material.defines = definesOf(sphere, overlaid);
+  material.needsUpdate = true;
+}
+
 /** What is drawn again and again. */
 interface Part {
   position: BufferAttribute;

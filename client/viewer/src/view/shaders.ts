@@ -4,7 +4,8 @@
 // and half a second to compile those of the normals.
 
 /** What is compiled in. */
-export const definesOf = (sphere: boolean): Record<string, string> => (sphere ? { SPHERE: '' } : {});
+export const definesOf = (sphere: boolean, overlaid = false): Record<string, string> =>
+  ({ ...(sphere && { SPHERE: '' }), ...(overlaid && { OVERLAY: '' }) });
 
 /** What every stage needs of the grid. */
 const GRID = /* glsl */ `
@@ -128,7 +129,6 @@ uniform float uTheta0;
 uniform vec3 uKey;
 uniform vec3 uFill;
 uniform int uMode;
-uniform float uOverlay;
 in vec2 vUv;
 in vec3 vWorld;
 out vec4 colour;
@@ -204,11 +204,11 @@ void main() {
     float gloss = (uMode == 1 ? 0.045 : 0.018) * eighth * eighth * eighth;
     colour = vec4(clamp((lit(texel, light) + gloss) * (inside ? 0.65 : 1.0), 0.0, 1.0), 1.0);
   }
-  if (uOverlay > 0.0) {
-    float level = float(texelFetch(uLevel, ivec2(vec2(fract(at.uv.x), min(at.uv.y, 0.99999)) * uLevelScale), 0).r);
-    float grey = dot(colour.rgb, vec3(0.3, 0.6, 0.1));
-    colour.rgb = mix(colour.rgb, spacingColour(level) * (0.35 + 0.75 * grey), uOverlay);
-  }
+#ifdef OVERLAY
+  float level = float(texelFetch(uLevel, ivec2(vec2(fract(at.uv.x), min(at.uv.y, 0.99999)) * uLevelScale), 0).r);
+  float grey = dot(colour.rgb, vec3(0.3, 0.6, 0.1));
+  colour.rgb = mix(colour.rgb, spacingColour(level) * (0.35 + 0.75 * grey), 0.5);
+#endif
 }
 `;
 

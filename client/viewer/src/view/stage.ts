@@ -41,6 +41,9 @@ export interface CameraPlace {
   target: [number, number, number];
 }
 
+/** What has programs of its own. */
+type Kind = `${Geometry}${'' | ', overlaid'}`;
+
 export interface StageEvents {
   /** A picture was drawn: marks on it must move along. */
   drawn(): void;
@@ -67,8 +70,8 @@ export class Stage {
    * The smallest surface of each kind, once its programs are compiled; while it is kept, so are they. Until then nothing
    * of that kind can be drawn without waiting for them.
    */
-  private readonly smallest = new Map<Geometry, Surface>();
-  private readonly warming = new Set<Geometry>();
+  private readonly smallest = new Map<Kind, Surface>();
+  private readonly warming = new Set<Kind>();
   private shading: Shading = 'lit';
   private overlay: Channel | null = null;
   /** Of the picture, in CSS px: asking the canvas would have the browser lay the page out each time. */
@@ -115,11 +118,11 @@ export class Stage {
       this.events.lost();
     });
     canvas.addEventListener('webglcontextrestored', () => {
-      void this.warm('cylinder');
+      void this.warm();
       this.events.restored();
     });
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement!);
-    void this.warm('cylinder');
+    void this.warm();
   }
 
   /** Show a scan. framed: with the camera where it sees everything; else it stays. */
@@ -132,7 +135,7 @@ export class Stage {
       this.scene.remove(old.object);
       old.dispose();
     }
-    void this.warm(geometryOf(snapshot.info));
+    void this.warm();
     if (framed) this.frame();
     this.draw();
   }
@@ -170,6 +173,7 @@ export class Stage {
   setLook(shading: Shading, overlay: Channel | null): void {
     [this.shading, this.overlay] = [shading, overlay];
     this.surface?.show(shading, overlay);
+    void this.warm();
     this.draw();
   }
 
@@ -266,20 +270,22 @@ export class Stage {
     await this.done();
     const { surface } = this;
     if (!surface || surface.isReady) return;
-    await this.smallest.get(geometryOf(surface.info))?.compileMore();
+    await this.smallest.get(this.kind)?.compileMore();
     if (surface !== this.surface || surface.isReady) return;
     surface.makeReady();
     this.draw();
   }
 
-  /** Draw the smallest surface of a kind, so that programs are there, and the card knows them, before a scan is. */
-  private async warm(geometry: Geometry): Promise<void> {
-    if (this.warming.has(geometry)) return;
-    this.warming.add(geometry);
-    const smallest = this.surfaceOf(nothing(geometry));
+  /** Draw the smallest surface of the kind shown, so that programs are there, and the card knows them, before a scan is. */
+  private async warm(): Promise<void> {
+    const { kind } = this;
+    if (this.warming.has(kind)) return;
+    this.warming.add(kind);
+    const smallest = this.surfaceOf(nothing(this.geometry));
+    smallest.show(this.shading, this.overlay);
     await smallest.compile(this.camera);
-    if (!this.warming.has(geometry)) return; // the card was lost meanwhile
-    this.smallest.set(geometry, smallest);
+    if (!this.warming.has(kind)) return; // the card was lost meanwhile
+    this.smallest.set(kind, smallest);
     if (!this.surface) {
       smallest.choose(this.camera, 1, this.detail);
       smallest.prepare(this.camera);
@@ -289,7 +295,15 @@ export class Stage {
   }
 
   private get isWarm(): boolean {
-    return this.smallest.has(this.surface ? geometryOf(this.surface.info) : 'cylinder');
+    return this.smallest.has(this.kind);
+  }
+
+  private get kind(): Kind {
+    return `${this.geometry}${this.overlay === null ? '' : ', overlaid'}`;
+  }
+
+  private get geometry(): Geometry {
+    return this.surface ? geometryOf(this.surface.info) : 'cylinder';
   }
 
   private surfaceOf({ info, ...state }: Snapshot): Surface {

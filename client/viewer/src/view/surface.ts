@@ -12,7 +12,7 @@ import type { ScanInfo } from '../protocol/messages.ts';
 import type { Changed } from '../protocol/model.ts';
 import { evened } from './coarse_colours.ts';
 import { compile } from './compile.ts';
-import { fan, fill, gridMesh, tileGrid } from './grid_mesh.ts';
+import { fan, fill, gridMesh, overlay, tileGrid } from './grid_mesh.ts';
 import type { GridMesh, Uniforms } from './grid_mesh.ts';
 import { Normals } from './normals.ts';
 import { joined, partOf } from './repaint.ts';
@@ -46,6 +46,7 @@ export class Surface {
   private dense: DataTexture;
   private readonly normals: Normals;
   isReady = false;
+  private isOverlaid = false;
   private readonly uniforms: Uniforms;
 
   constructor(
@@ -71,7 +72,7 @@ export class Surface {
       uPitchMm: { value: info.pitchMm }, uZMaxMm: { value: info.zMaxMm }, uTheta0: { value: info.theta0Rad },
       uPoles: { value: new Vector2() }, uTile: { value: tileSide }, uNormals: { value: null }, uCoarse: { value: this.coarse },
       uDense: { value: this.dense }, uLevel: { value: this.levels[0] }, uLevelScale: { value: new Vector2() },
-      uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 }, uOverlay: { value: 0 },
+      uKey: { value: new Vector3() }, uFill: { value: new Vector3() }, uMode: { value: 0 },
     };
     this.tiles = new Tiles(info, tileSide, this.thinned);
     this.closePoles();
@@ -132,14 +133,16 @@ export class Surface {
   }
 
   /** How to shade, and whose spacing to lay over it. */
-  show(shading: Shading, overlay: Channel | null): void {
-    const levels = this.levels[overlay ?? RANGE];
+  show(shading: Shading, shown: Channel | null): void {
+    const levels = this.levels[shown ?? RANGE];
     this.uniforms['uMode']!.value = SHADINGS.indexOf(shading);
-    this.uniforms['uOverlay']!.value = overlay === null ? 0 : 0.5;
     this.uniforms['uLevel']!.value = levels;
     const { width, height, textureWidth, textureHeight } = this.info;
-    const scale = overlay === TEXTURE ? [textureWidth / TEXTURE_BLOCK, textureHeight / TEXTURE_BLOCK] : [width / RANGE_BLOCK, height / RANGE_BLOCK];
+    const scale = shown === TEXTURE ? [textureWidth / TEXTURE_BLOCK, textureHeight / TEXTURE_BLOCK] : [width / RANGE_BLOCK, height / RANGE_BLOCK];
     (this.uniforms['uLevelScale']!.value as Vector2).set(scale[0]!, scale[1]!);
+    if (this.isOverlaid === (shown !== null)) return;
+    this.isOverlaid = shown !== null;
+    for (const mesh of [...this.meshes, ...this.fans]) if (mesh) overlay(mesh, isSphere(this.info), this.isOverlaid);
   }
 
   /** Choose how finely tiles are drawn for a camera. Returns whether any is drawn otherwise than before. */
@@ -202,6 +205,7 @@ export class Surface {
   }
 
   private added(mesh: GridMesh): GridMesh {
+    if (this.isOverlaid) overlay(mesh, isSphere(this.info), true);
     this.object.add(mesh);
     return mesh;
   }
