@@ -164,6 +164,18 @@ def test_a_look_draws_its_part_of_the_picture_as_if_all_were_drawn(browser: Brow
         assert np.abs(parts - crop(page, 0.5, 0.5, 500)).max() <= 2
 
 
+def test_the_spacing_held_is_laid_over_the_surface_and_taken_off(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        overlay = page.get_by_label("Overlay")
+        overlay.evaluate("(one) => (one.closest('details').open = true)")
+        wait_drawn(page)
+        plain = crop(page, 0.5, 0.5, 200)
+        overlay.select_option("texture")
+        until(page, lambda: psnr(crop(page, 0.5, 0.5, 200), plain) < 25)
+        overlay.select_option("none")
+        until(page, lambda: psnr(crop(page, 0.5, 0.5, 200), plain) > 45)
+
+
 def test_nothing_is_seen_through_a_surface_come_near(browser: Browser, node: RunningNode) -> None:
     with opened(browser, node.url) as page:
         page.locator("#view").focus()

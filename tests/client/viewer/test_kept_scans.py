@@ -298,7 +298,11 @@ def test_an_offline_copy_shows_the_same_and_asks_nobody(browser: Browser, kept: 
     with opened(browser, kept.at("head")) as page:
         click(page, 0.5, 0.5)
         wait_updates(page, 1)
+        surface = page.get_by_label("Surface")
+        surface.evaluate("(one) => (one.closest('details').open = true)")
+        surface.select_option("relief")
         page.mouse.move(2, 2)
+        wait_drawn(page)
         picture = crop(page, 0.5, 0.5, 300)
         page.locator("summary:has-text('This scan')").click()
         page.get_by_role("button", name="Offline copy of this view").click()
