@@ -108,7 +108,8 @@ export class App {
     this.sidecar = new OpenSidecar({ say, known: (scan, sidecar) => this.takeSidecar(scan, sidecar) });
     this.scans = new ScanList((id) => this.open(id), (scan) => this.tell({ kind: 'thumbnail', scan }));
     this.pins = new Pins(this.pane, this.sidecar, () => this.writeState());
-    this.about = new AboutPanel((changes) => void this.sidecar.save(changes, true), () => void this.remove(), (named) => this.copy(named));
+    this.about = new AboutPanel((changes) => void this.sidecar.save(changes, true), (scan) => this.titleOf(scan),
+      (scan) => void this.remove(scan), (named) => this.copy(named));
     this.display = new DisplayPanel(() => this.showAs());
     if (poster) this.pane.showMeanwhile(poster);
     this.frame.pictures.append(this.pane.element);
@@ -301,13 +302,14 @@ export class App {
 
   private showComparison(): void {
     const [open, beside] = [this.pane.info?.id ?? null, this.comparison.state?.scan ?? null];
-    const title = (id: string | null) => {
-      const scan = this.scans.scans.find((one) => one.id === id);
-      return scan ? strings.scans.title(scan) : strings.scans.untitled;
-    };
     this.comparePanel.show(this.scans.scans, open, beside);
-    this.frame.caption(title(open), beside && title(beside), () => this.comparison.close());
+    this.frame.caption(this.titleOf(open), beside && this.titleOf(beside), () => this.comparison.close());
     this.showAs();
+  }
+
+  private titleOf(id: string | null): string {
+    const scan = this.scans.scans.find((one) => one.id === id);
+    return scan ? strings.scans.title(scan) : strings.scans.untitled;
   }
 
   private measured(measured: Measured): void {
@@ -329,14 +331,13 @@ export class App {
     this.writeState();
   }
 
-  private async remove(): Promise<void> {
-    const scan = this.pane.info?.id;
-    if (!scan) return;
+  private async remove(scan: string): Promise<void> {
     try {
       await deleteScan(scan);
     } catch (error) {
       return this.frame.say(strings.failed((error as Error).message));
     }
+    if (this.pane.info?.id !== scan) return void this.refreshScans();
     this.close();
     this.state = { ...NOWHERE };
     await this.refreshScans();

@@ -162,7 +162,7 @@ export const strings = {
     save: 'Save',
     saved: 'Saved.',
     remove: 'Delete the scan…',
-    sure: 'Delete this scan for good? It cannot be brought back.',
+    sure: (scan: string) => `Delete the scan “${scan}” for good? It cannot be brought back.`,
     yes: 'Delete it',
     no: 'Keep it',
     download: 'Download',

@@ -17,20 +17,23 @@ export function drawThumbnail(
   const scale = (side * MARGIN) / Math.max(heightMm, 2 * reach);
   const pixels = new Uint8ClampedArray(4 * side * side);
   const depth = new Float32Array(side * side).fill(-Infinity);
-  for (let row = 0; row < th; row++) {
-    const r = Math.floor((row * h) / th);
-    const share = (row + 0.5) / th;
+  const [rows, columns] = [Math.max(th, 2 * side), Math.max(tw, 4 * side)]; // fewer leave gaps where they lie apart
+  for (let row = 0; row < rows; row++) {
+    const share = (row + 0.5) / rows;
+    const [above, below, part] = between(share * h - 0.5, h);
+    const texelRow = tw * Math.floor(share * th);
     const [flat, up] = sphere ? [Math.sin(Math.PI * share), Math.cos(Math.PI * share)] : [1, 0];
-    for (let column = 0; column < tw; column++) {
-      const c = Math.floor((column * w) / tw);
-      const radius = steps[r * w + c]! * info.stepMm;
-      const angle = info.theta0Rad + (2 * Math.PI * (column + 0.5)) / tw - facing;
+    for (let column = 0; column < columns; column++) {
+      const c = Math.floor((column * w) / columns);
+      const [one, other] = [steps[above * w + c]!, steps[below * w + c]!];
+      const radius = (one && other ? one + (other - one) * part : part < 0.5 ? one : other) * info.stepMm;
+      const angle = info.theta0Rad + (2 * Math.PI * (column + 0.5)) / columns - facing;
       const near = radius * flat * Math.cos(angle);
       if (radius === 0 || near < 0) continue;
       const x = Math.round(side / 2 + radius * flat * Math.sin(angle) * scale);
       const y = Math.round(side / 2 - (sphere ? radius * up : (0.5 - share) * heightMm) * scale);
-      const shade = 0.45 + 0.6 * slopeLight(steps, r, c, w, angle);
-      const [from, at] = [4 * (row * tw + column), y * side + x];
+      const shade = 0.45 + 0.6 * slopeLight(steps, part < 0.5 ? above : below, c, w, angle);
+      const [from, at] = [4 * (texelRow + Math.floor((column * tw) / columns)), y * side + x];
       for (const pixel of [at, at + 1, at + side, at + side + 1]) {
         if (near <= depth[pixel]!) continue;
         depth[pixel] = near;
@@ -40,6 +43,13 @@ export function drawThumbnail(
     }
   }
   return pixels;
+}
+
+/** The two rows that a place lies between, and how far from the first to the second it is. */
+function between(place: number, rows: number): [number, number, number] {
+  const at = Math.min(Math.max(place, 0), rows - 1);
+  const first = Math.floor(at);
+  return [first, Math.min(first + 1, rows - 1), at - first];
 }
 
 /** How much a cell faces us: its slope round the axis, from its neighbours. */

@@ -3,6 +3,7 @@ import { test } from 'node:test';
 import { PerspectiveCamera, Ray, Vector3 } from 'three';
 import { backoffMs } from '../src/backoff.ts';
 import { inParts } from '../src/telling.ts';
+import { drawThumbnail, THUMBNAIL_SIDE } from '../src/thumbnail.ts';
 import { formatState, parseState } from '../src/url_state.ts';
 import { evened } from '../src/view/coarse_colours.ts';
 import { boundsOf, fittingDistance } from '../src/view/framing.ts';
@@ -74,6 +75,19 @@ test('a void is looked through, on to the other side', () => {
   const from = new Vector3(300 * Math.cos(angle), 0, -300 * Math.sin(angle));
   const picked = pick(INFO, steps, new Ray(from, from.clone().negate().normalize()))!;
   assert.ok(Math.abs(picked.u - (inVoid.u + 0.5)) < 1e-3);
+});
+
+test('a small picture of a stretched sphere has no gaps', () => {
+  const [across, down] = [SPHERE.coarseWidth, SPHERE.coarseHeight];
+  const steps = new Uint16Array(across * down).map((_, cell) => (cell < across * (down / 2) ? 8000 : 2000));
+  const pixels = drawThumbnail(SPHERE, steps, new Uint8Array(3 * 90 * 50).fill(200), 0);
+  for (const along of [1, THUMBNAIL_SIDE]) { // down the middle, then across it a quarter from the top
+    const start = along === 1 ? THUMBNAIL_SIDE * 24 : 48;
+    const step = along === 1 ? 1 : THUMBNAIL_SIDE;
+    const line = Array.from({ length: THUMBNAIL_SIDE }, (_, at) => pixels[4 * (start + step * at) + 3]! > 0);
+    const inside = line.slice(line.indexOf(true), line.lastIndexOf(true) + 1);
+    assert.ok(inside.length > 50 && inside.every(Boolean), `${along}: ${line.map(Number).join('')}`);
+  }
 });
 
 test('a sphere is picked where it is drawn, its poles too, from any side', () => {

@@ -270,6 +270,13 @@ def test_a_scan_is_renamed_and_deleted_after_being_asked(browser: Browser, tmp_p
             page.get_by_role("button", name="Keep it").click()
             assert page.get_by_role("button", name="back, left").is_visible()
             page.get_by_role("button", name="Delete the scan").click()
+            page.get_by_text("Delete the scan “back, left · ").wait_for()
+            here = page.evaluate("location.hash")
+            page.evaluate("location.hash = `scan=${'0'.repeat(32)}`")
+            page.get_by_text("not there any more").wait_for()
+            assert not page.locator("dialog[open]").count(), "who goes elsewhere is asked nothing about the scan there"
+            page.evaluate("(hash) => { location.hash = hash; }", here)
+            page.get_by_role("button", name="Delete the scan").click()
             page.get_by_role("button", name="Delete it").click()
             page.get_by_text("None yet.").wait_for()
             page.get_by_text("No scan yet.").wait_for()

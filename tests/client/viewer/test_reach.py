@@ -14,6 +14,22 @@ from tests.client.viewer.browser import barriers, crop, layout_faults, opened, p
 from tests.system.line import RunningNode, run_line
 
 
+# What has the focus, and whether it looks otherwise than without; null at the end of the page.
+FOCUSED = """() => {
+  const one = document.activeElement;
+  if (one === document.body) return null;
+  const looks = () => {
+    const style = getComputedStyle(one);
+    return [style.outlineStyle === 'none' ? '' : style.outline, style.boxShadow, style.borderColor].join();
+  };
+  const focused = looks();
+  one.blur();
+  const shows = looks() !== focused;
+  one.focus();
+  return { name: `${one.tagName} ${one.innerText || one.ariaLabel || one.id}`.trim(), shows };
+}"""
+
+
 @pytest.fixture(scope="module")
 def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
     """A node with a small head: what is tested here does not depend on its size."""
@@ -67,6 +83,29 @@ def test_everything_can_be_done_by_keyboard(browser: Browser, node: RunningNode)
         tab_to(page, "summary:has-text('Display')")
         page.keyboard.press("Enter")
         assert page.get_by_label("Overlay").is_visible()
+        page.get_by_role("radio", name="sharpens").focus()
+        for _ in ("measures", "traces a path", "sets a pin"):
+            page.keyboard.press("ArrowRight")
+        page.locator("#view").focus()
+        page.keyboard.press("Enter")
+        expect(page.get_by_label("Label of the new pin")).to_be_focused()
+        page.keyboard.type("mole")
+        page.keyboard.press("Enter")
+        page.get_by_role("button", name="Show pin mole").wait_for()
+        expect(page.locator("#view")).to_be_focused()
+
+
+def test_what_has_the_focus_shows_it(browser: Browser, node: RunningNode) -> None:
+    with opened(browser, node.url) as page:
+        unfold(page)
+        met, unseen = 0, list[str]()
+        for _ in range(80):
+            page.keyboard.press("Tab")
+            looks = page.evaluate(FOCUSED)
+            if looks is None:
+                break
+            met, unseen = met + 1, unseen + [looks["name"]] * (not looks["shows"])
+        assert met > 30 and unseen == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -18,11 +18,15 @@ export class AboutPanel {
   private scan = '';
   private readonly form: HTMLFormElement;
   private readonly dialog: HTMLDialogElement;
+  private readonly sure = h('p', { id: 'sure' });
   private readonly remove: HTMLButtonElement;
   private readonly mayNot = h('p', { class: 'quiet', hidden: true }, strings.role);
   private readonly copied = h('p', { class: 'quiet', role: 'status' });
 
-  constructor(save: (changes: Changes) => void, remove: () => void, makeCopy: (named: boolean) => void) {
+  /** title: what to call a scan. remove: that scan, whatever is open by then. */
+  constructor(
+    save: (changes: Changes) => void, title: (scan: string) => string, remove: (scan: string) => void, makeCopy: (named: boolean) => void,
+  ) {
     const { about } = strings;
     this.inputs = { name: text(200), subject: text(64), body_site: text(100) };
     const submit = (event: Event) => {
@@ -37,12 +41,16 @@ export class AboutPanel {
     const close = () => this.dialog.close();
     const yes = () => {
       close();
-      remove();
+      remove(this.scan);
     };
-    this.dialog = h('dialog', { 'aria-labelledby': 'sure' }, h('article', {}, h('p', { id: 'sure' }, about.sure),
+    this.dialog = h('dialog', { 'aria-labelledby': 'sure' }, h('article', {}, this.sure,
       h('footer', { class: 'row' }, h('button', { type: 'button', class: 'secondary', click: close }, about.no),
         h('button', { type: 'button', class: 'danger', click: yes }, about.yes))));
-    this.remove = h('button', { type: 'button', class: 'secondary', click: () => this.dialog.showModal() }, about.remove);
+    const ask = () => {
+      this.sure.textContent = about.sure(title(this.scan));
+      this.dialog.showModal();
+    };
+    this.remove = h('button', { type: 'button', class: 'secondary', click: ask }, about.remove);
     const copy = h('button', { type: 'button', class: 'secondary', click: () => void this.copy() }, about.copy);
     const offline = new CopyDialog(makeCopy);
     this.element = section(about.heading, false, this.samples, this.form, this.mayNot,
@@ -52,7 +60,10 @@ export class AboutPanel {
 
   show(info: ScanInfo): void {
     this.element.hidden = false;
-    if (info.id !== this.scan) this.fill({ name: '', subject: '', body_site: '' }, true);
+    if (info.id !== this.scan) {
+      this.dialog.close(); // it asked about the one before, as where somebody goes back meanwhile
+      this.fill({ name: '', subject: '', body_site: '' }, true);
+    }
     this.scan = info.id;
     this.samples.textContent = strings.about.samples(info.width, info.height, info.textureWidth, info.textureHeight);
     refill(this.downloads, ...Object.entries(strings.about.formats).map(([format, name]) =>
@@ -61,6 +72,7 @@ export class AboutPanel {
   }
 
   hide(): void {
+    this.dialog.close();
     this.element.hidden = true;
   }
 

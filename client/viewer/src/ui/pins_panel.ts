@@ -11,6 +11,7 @@ export class PinsPanel {
   private readonly form: HTMLFormElement;
   private readonly note = h('p', { class: 'quiet', hidden: true }, strings.pins.unsaved);
   private place: Place | null = null;
+  private cameFrom: Element | null = null;
   private mayChange = true;
 
   constructor(
@@ -30,7 +31,10 @@ export class PinsPanel {
 
   /** Ask for the label of a pin at a place; null: of none. */
   ask(place: Place | null): void {
+    const wasIn = this.form.contains(document.activeElement);
     this.place = place;
+    if (place && !wasIn) this.cameFrom = document.activeElement;
+    if (!place && wasIn) (this.cameFrom as HTMLElement | null)?.focus({ preventScroll: true }); // else who uses keys is nowhere
     this.form.hidden = place === null;
     this.label.value = '';
     if (!place) return;
