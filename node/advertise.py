@@ -16,7 +16,8 @@ from zeroconf.asyncio import AsyncZeroconf
 from protocol.messages import PROTOCOL
 
 SERVICE = "_foveascan._tcp.local."
-NAME_MAX_BYTES = 63
+LABEL_MAX_BYTES = 63
+ID_DIGITS = 8  # in an instance's label
 HEARD_S = 3.0
 ANSWER_S = 0.5  # then another announced node is asked
 
@@ -29,9 +30,9 @@ class Advertisement:
         self._interfaces = _interfaces(host)
         tls = {"tls": "1", "fp": fingerprint} if fingerprint else {"tls": "0"}
         properties = {"proto": PROTOCOL, "id": node_id, "name": name, "state": "ready", **tls}
-        label = name.encode()[:NAME_MAX_BYTES].decode(errors="ignore").replace(".", "-")
         self._info = ServiceInfo(
-            SERVICE, f"{label}.{SERVICE}", port=port, properties=properties, server=f"foveascan-{node_id}.local.",
+            SERVICE, f"{_label(name, node_id)}.{SERVICE}", port=port, properties=properties,
+            server=f"foveascan-{node_id}.local.",
             addresses=[address.packed] if not address.is_unspecified else _own_addresses(),
         )  # fmt: skip
 
@@ -48,6 +49,13 @@ class Advertisement:
     ) -> None:
         await self._zeroconf.async_unregister_all_services()
         await self._zeroconf.async_close()
+
+
+def _label(name: str, node_id: str) -> str:
+    """What an instance is called, its own even where nodes of one name come up at once, as after a power cut: each of
+    them would find the name free, and clients would see now one and now the other."""
+    own = f" ({node_id[:ID_DIGITS]})"
+    return name.encode()[: LABEL_MAX_BYTES - len(own)].decode(errors="ignore").replace(".", "-") + own
 
 
 def is_heard(host: str, node_id: str | None) -> bool:

@@ -31,6 +31,17 @@ async def test_one_of_several_nodes_is_heard_and_nothing_listens_any_longer(monk
             assert not [thread.name for thread in threading.enumerate() if "ServiceBrowser" in thread.name]
 
 
+async def test_nodes_of_one_name_that_come_up_at_once_are_all_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(advertise, "HEARD_S", 60.0)
+    name, ids = f"{'ward ' * 20}{unique()}", [uuid.uuid4().hex[:16] for _ in range(2)]
+    announced = [Advertisement(name, node_id, HOST, port) for port, node_id in enumerate(ids, 7345)]
+    await asyncio.gather(*(one.__aenter__() for one in announced))
+    try:
+        assert all([await asyncio.to_thread(is_heard, HOST, node_id) for node_id in ids])
+    finally:
+        await asyncio.gather(*(one.__aexit__(None, None, None) for one in announced))
+
+
 def test_a_node_that_is_not_announced_is_not_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(advertise, "HEARD_S", 0.2)
     assert not is_heard(HOST, unique())

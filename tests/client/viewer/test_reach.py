@@ -13,7 +13,6 @@ from playwright.sync_api import Browser, Page, Route, expect
 from tests.client.viewer.browser import barriers, crop, layout_faults, opened, psnr, wait_drawn, wait_updates
 from tests.system.line import RunningNode, run_line
 
-
 # What has the focus, and whether it looks otherwise than without; null at the end of the page.
 FOCUSED = """() => {
   const one = document.activeElement;
