@@ -52,10 +52,11 @@ def run_export(args: argparse.Namespace) -> int:
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Read the file here, whatever it takes, and send the node a plain grid; print the new scan's id."""
+    """Read the file here, whatever it takes, and send the node a plain grid; print the scan's id and its size."""
     import asyncio
 
     from exchange.formats import read_scan
+    from exchange.mesh import extent_mm
 
     if args.output:
         _check_grid(args.output)
@@ -73,8 +74,11 @@ def run_import(args: argparse.Namespace) -> int:
         sent = asyncio.run(_import(args, found))
         record = {"scan": sent.scan, "new": sent.is_new}
         line = f"scan {sent.scan}{'' if sent.is_new else ', which the node had already; it is the newest now'}"
-    record |= {"geometry": spec.geometry, "note": found.note}
-    print(json.dumps(record) if args.json else "\n".join(filter(None, (line, printable(found.note)))), flush=True)
+    size_mm = extent_mm(found.grid)
+    record |= {"geometry": spec.geometry, "note": found.note, "sizeMm": [round(side_mm, 3) for side_mm in size_mm]}
+    large = "{:.4g} x {:.4g} mm across, {:.4g} mm high".format(*size_mm)
+    lines = filter(None, (line, large, printable(found.note)))
+    print(json.dumps(record) if args.json else "\n".join(lines), flush=True)
     return 0
 
 

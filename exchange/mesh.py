@@ -207,6 +207,21 @@ CORNER_ROWS = np.array([[0, 1, 1], [0, 1, 0], [0, 1, 0], [0, 1, 1]])
 CORNER_COLUMNS = np.array([[0, 0, 1], [0, 1, 1], [0, 0, 1], [1, 0, 1]])
 
 
+def extent_mm(grid: Grid) -> tuple[float, float, float]:
+    """How large what a grid has measured is, along x, y and up; zeros where it has measured nothing. [mm]"""
+    spec = grid.spec
+    rows, columns = np.nonzero(grid.range_steps)
+    if not rows.size:
+        return 0.0, 0.0, 0.0
+    radius = grid.range_steps[rows, columns] * spec.step_mm
+    sin_v, cos_v = _polar(grid)
+    is_sphere = spec.geometry == "sphere"
+    out, up = (radius * sin_v[rows], radius * cos_v[rows]) if is_sphere else (radius, spec.height_mm(rows))
+    angle = spec.angle_rad(np.arange(spec.width))
+    x, y = out * np.cos(angle)[columns], out * np.sin(angle)[columns]
+    return float(np.ptp(x)), float(np.ptp(y)), float(np.ptp(up))
+
+
 def sample_lattice(texture: ImageArray, u: FloatArray, v: FloatArray) -> ImageArray:
     """A texture at every (u, v) of a lattice, bilinear, cyclic in u, clamped in v. (len(v), len(u), 3) uint8"""
     height, width = texture.shape[:2]

@@ -18,6 +18,7 @@ from client import NodeLost, RequestRefused
 from client.exchange_command import add_subcommands
 from exchange.errors import ExchangeError
 from exchange.formats import read_scan
+from exchange.mesh import Band, GridMesh, Seam
 from exchange.native import write_native
 from exchange.whole_file import whole_file
 from node.auth import LOGIN, Login
@@ -83,8 +84,9 @@ def test_a_mesh_goes_in_and_comes_out(tmp_path: Path, capsys: pytest.CaptureFixt
         assert run("import", str(ball), "--size", "72x40:128x64", "--node", url, "--json") == 0
         (scan,) = library.scans()
         note = "a closed mesh seen from a centre at 0.0 mm"
-        said = {"scan": scan.id, "new": True, "geometry": "sphere", "note": note}
-        assert json.loads(capsys.readouterr().out) == said
+        said = json.loads(capsys.readouterr().out)
+        assert said.pop("sizeMm") == pytest.approx([40, 40, 40], abs=0.1)  # a row's half is missing at each pole
+        assert said == {"scan": scan.id, "new": True, "geometry": "sphere", "note": note}
         assert (scan.about.name, scan.about.note) == ("ball", note)
         assert run("export", str(tmp_path / "out.stl"), "--node", url, "--scan", scan.id, "--json") == 0
         said = json.loads(capsys.readouterr().out)
@@ -98,7 +100,11 @@ def test_a_grid_goes_round_without_a_change(tmp_path: Path, capsys: pytest.Captu
         scan = library.add(vase(holes=True), About(0.0, name="vase"))
         assert run("export", str(tmp_path / "vase.npz"), "--node", url) == 0
         assert run("import", str(tmp_path / "vase.npz"), "--node", f"{url}/", "--name", "again") == 0
-        assert capsys.readouterr().out.endswith(f"scan {scan.id}, which the node had already; it is the newest now\n")
+        said, large = capsys.readouterr().out.splitlines()[-2:]
+        assert said == f"scan {scan.id}, which the node had already; it is the newest now"
+        corners = GridMesh(scan.grid, Seam.SHARED).positions(Band(0, scan.grid.spec.height))
+        across_x, across_y, high = np.ptp(corners, axis=0)
+        assert large == f"{across_x:.4g} x {across_y:.4g} mm across, {high:.4g} mm high"
         assert [kept.about for kept in library.scans()] == [About(0.0, name="again")], "it was swept when it was"
 
 
