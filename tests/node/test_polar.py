@@ -10,10 +10,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from client.model import Model
+from node import refine_texture
+from node.coded import Part
 from node.first_view import FirstView, build_first_view, texture_as_seen
 from node.library import Scan
 from node.polar import FARTHEST_RAD, PolarTexture, polar_samples, reaches
-from node.refine_texture import Compared
+from node.refine_texture import Compared, compared_with
 from node.texture_model import TextureModel
 from protocol.codec import TextureCodec, decode_texture, encode_texture
 from protocol.errors import LatticeError
@@ -209,6 +211,27 @@ def test_what_a_pole_takes_and_misses_is_known_beforehand(ball: tuple[Scan, Firs
         error, values = np.sum([one.error(patch) for one, patch in zip(compared, seen, strict=True)], axis=0)
         assert expected.mse(quality) == pytest.approx(error / values, rel=0.4)
         assert expected.size_bytes(quality) == pytest.approx(len(payload), rel=0.4)
+
+
+@pytest.mark.parametrize(("sampled_from", "off"), [(1 << 30, 1e-5), (0, 0.05)])
+@pytest.mark.parametrize("v", [0.0, 0.12, 0.93])
+def test_what_an_image_of_a_pole_leaves_is_told_by_a_quarter_of_many_texels(
+    ball: tuple[Scan, FirstView, TextureModel], monkeypatch: pytest.MonkeyPatch, v: float, sampled_from: int, off: float
+) -> None:
+    scan, _, model = ball
+    region = cap_region(0.01, v, 0.08, SHAPE.width, SHAPE.height)
+    strips = strips_of(listed(region))
+    assert (polar := strips[0].polar) is not None and model.maps is not None
+    payload = encode_texture(model.maps.image(strips, polar), TextureCodec.HTJ2K, 20)
+    seen = decode_texture(payload, TextureCodec.HTJ2K, 20, polar.sample_shape)
+    pairs = zip(strips, texture_patches(strips, [seen]), strict=True)
+    whole = np.sum([Compared(scan, strip.selection, region).error(patch) for strip, patch in pairs], axis=0)
+    monkeypatch.setattr(refine_texture, "SAMPLED_FROM", sampled_from)
+    parts = [compared_with(scan, strip, region).part_error(Part(strip, image=seen)) for strip in strips]
+    error, values = np.sum(parts, axis=0)
+    assert values == pytest.approx(whole[1], rel=max(off, 1e-9)) and error / values == pytest.approx(
+        whole[0] / whole[1], rel=off
+    )
 
 
 def test_what_more_images_of_poles_miss_is_learned(ball: tuple[Scan, FirstView, TextureModel]) -> None:

@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from node import range_model, refine_range
 from node.first_view import build_first_view
 from node.library import Scan
 from node.quality import Encodes
+from node.range_bitmaps import reach_range
 from node.range_model import SPACINGS, RangeModel, how_often, percentile_of
 from node.range_search import RangeSearch
 from node.refine_range import _TrialPart, trial_of
 from protocol.grid import Grid, GridSpec
-from protocol.messages import Look
+from protocol.messages import Look, RangeParameters
 from protocol.region import region_round
 from protocol.rings import thin_grid
 from protocol.sphere import DirectionGrid, click_of, region_on, vectors
@@ -85,6 +87,31 @@ def test_it_says_of_a_sphere_what_a_trial_would_find(sphere: Scan, theta_v: floa
     assert 2 in trials and 4 in trials
     for p, trial in trials.items():  # samples may begin elsewhere than those of the whole rows
         assert 0.8 * trial.error(1) - 1 <= model.error(region, p) <= 1.25 * trial.error(1) + 2
+
+
+@pytest.mark.parametrize("theta_v", [0.0, 0.8, math.pi / 2])
+def test_of_many_cells_a_ninth_tells_what_interpolating_misses(
+    sphere: Scan, monkeypatch: pytest.MonkeyPatch, theta_v: float
+) -> None:
+    spec = sphere.spec
+    model = RangeModel(spec, sphere.range_steps, sphere.filled)
+    region = region_on(spec, *click_of(theta_v, 1.0), 0.4, spec.width, spec.height)
+    whole = [model.error(region, p) for p in (2, 4)]
+    monkeypatch.setattr(range_model, "MANY_CELLS", 0)
+    assert [model.error(region, p) for p in (2, 4)] == pytest.approx(whole, rel=0.1) and min(whole) > 1
+
+
+def test_what_a_trial_surveyed_is_encoded(sphere: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec, wanted = sphere.spec, RangeParameters(p=2, quantum=9)
+    state = build_first_view(sphere, "htj2k", 32768).state
+    near, far = (region_on(spec, *click_of(0.3, angle), 0.05, spec.width, spec.height) for angle in (1.0, 4.0))
+    (afresh,) = reach_range(sphere, state, near, wanted, 20.0)
+    elsewhere = reach_range(sphere, state, near, wanted, 20.0, trial=trial_of(sphere, state, far, 2))
+    trial = trial_of(sphere, state, near, 2)
+    monkeypatch.setattr(refine_range, "_surveyed", lambda *_: pytest.fail("surveyed again"))
+    (coded,) = reach_range(sphere, state, near, wanted, 20.0, trial=trial)
+    for one in (elsewhere[0], coded):
+        assert (one.payload, one.mask, one.parameters) == (afresh.payload, afresh.mask, afresh.parameters)
 
 
 def test_a_closed_object_is_sampled_as_far_apart_as_its_shape_allows(sphere: Scan) -> None:
