@@ -151,7 +151,8 @@ def _adopted(shape: ChannelShape, coded: Coded | None) -> BoolArray:
 def _allowed_beyond(scan: Scan, region: Region) -> float:
     """How many measured cells of a region may be further off than its target, by area (99th percentile, "higher")."""
     rows = np.arange(region.top, region.top + region.height)
-    void = scan.range_steps[region.rows].take(region.columns, axis=1) == VOID
+    void = scan.range_steps[region.rows]
+    void = (void.take(region.columns, axis=1) if region.width < region.turn else void) == VOID
     area = region.area
     if void.any():
         inside = region.inside(rows, range(region.left, region.left + region.width))

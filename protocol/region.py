@@ -119,11 +119,25 @@ class Cap(Region):
         return self._counts[side]
 
     def touched(self, side: int) -> BoolArray:
-        """Which blocks of that rectangle it touches. (rows, columns) bool"""
-        return np.asarray(self.counts(side) > 0)
+        """Which blocks of that rectangle it touches: in each row of them one run. (rows, columns) bool, read-only"""
+        if side not in self._touched:
+            first, top, wide, high = self.blocks(side)
+            starts = np.maximum(side * np.arange(top, top + high) - self.top, 0)
+            left = np.minimum.reduceat(self.row_left, starts)
+            width = np.maximum.reduceat(self.row_left + self.row_width, starts) - left
+            begin, count = blocks_touched(left, np.minimum(width, self.turn), side, self.turn)
+            column = (first + np.arange(wide) - begin[:, None]) % -(-self.turn // side)
+            touched = column < count[:, None]
+            touched.flags.writeable = False
+            self._touched[side] = touched
+        return self._touched[side]
 
     @cached_property
     def _counts(self) -> dict[int, IntArray]:
+        return {}
+
+    @cached_property
+    def _touched(self) -> dict[int, BoolArray]:
         return {}
 
 
