@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime as dt
 import fcntl
-import http.client
 import os
 import shutil
 import socket
@@ -21,8 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import msgspec
-
 from drivers.conformance import examine_link
 from drivers.discover import config_for, find_ports, open_port
 from node import config as settings
@@ -33,6 +30,7 @@ from node.durable import EASY_BYTES
 from node.identity import known_identity
 from node.library import survey
 from node.library_folder import holder_of
+from node.listener import Listener, who_answers
 from node.machine import (
     ACCOUNT,
     READ,
@@ -58,8 +56,6 @@ SWEEP_L_BYTES = 4096 * 2048 * 2 + 8192 * 4096 * 3
 DISK_MIN_BYTES = 2 * SWEEP_L_BYTES  # a journal and the scan it becomes
 MEMORY_BASE_BYTES, MEMORY_FACTOR = 150 << 20, 6  # issue 3: 6x the arrays of a scan, and this
 ENDS_SOON = dt.timedelta(days=14)
-ANSWER_S = 2.0
-ANSWER_BYTES_MAX = 65536
 
 LOOKED_UP = ("usb:", "serial:", "tcp:")  # addresses that are no paths
 
@@ -99,7 +95,7 @@ def examine(path: Path | None, overrides: Mapping[str, object]) -> Iterator[Find
     library = config.library.path
     yield Finding("configuration", "ok", str(path) if path else "the defaults: no file was named")
     account, port = node_account(), config.capture.scanner
-    who = _who_answers(config.server)
+    who = who_answers(config.server)
     holder = holder_of(library)
     runs = who == "node" and holder != 0  # the node of these settings, as far as can be seen
     yield check_port(port, is_used=runs)
@@ -202,10 +198,10 @@ def check_permission(port: str | None, account: Account) -> Finding:
     return Finding("permission", "problem", found, rule if account.name == ACCOUNT else f"{rule}; {join}")
 
 
-def check_server(server: settings.Server, who: str, holder: int | None = None) -> Finding:
+def check_server(server: settings.Server, who: Listener, holder: int | None = None) -> Finding:
     """Whether the address can be served.
 
-    who : "node", "other" or "nobody" answers there.  holder : the process that works in the library, 0: none.
+    who : answers there.  holder : the process that works in the library, 0: none.
     """
     if who == "node" and holder == 0:
         cure = "stop it, or choose another server.listen; or name its own library"
@@ -387,41 +383,6 @@ def _refusal(folder: Path) -> str:
             return ""
     except OSError as error:
         return error.strerror or str(error)
-
-
-def _who_answers(server: settings.Server) -> Literal["node", "other", "nobody"]:
-    """Who listens at the node's address."""
-    if server.port == 0:
-        return "nobody"
-    who = _answer(server, server.insecure)
-    if who == "strange":  # a node that was told --insecure, or not to be: nobody need tell us
-        who = "node" if _answer(server, not server.insecure) == "node" else "other"
-    return who
-
-
-def _answer(server: settings.Server, insecure: bool) -> Literal["node", "other", "nobody", "strange"]:
-    """Who answers in plain HTTP, or over TLS. "strange": it does not speak that."""
-    line = _line_to(server, insecure)
-    try:
-        line.request("GET", "/healthz")
-        answer = msgspec.json.decode(line.getresponse().read(ANSWER_BYTES_MAX))
-        return "node" if isinstance(answer, dict) and "status" in answer else "other"
-    except (ssl.SSLError, ConnectionResetError):
-        return "strange"
-    except OSError as error:
-        return "other" if error.errno is None else "nobody"
-    except (http.client.HTTPException, ValueError, RecursionError):
-        return "other"
-    finally:
-        line.close()
-
-
-def _line_to(server: settings.Server, insecure: bool) -> http.client.HTTPConnection:
-    if insecure:
-        return http.client.HTTPConnection(server.host, server.port, timeout=ANSWER_S)
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE  # nothing is told, and little believed
-    return http.client.HTTPSConnection(server.host, server.port, timeout=ANSWER_S, context=context)
 
 
 def _size(size_bytes: int) -> str:

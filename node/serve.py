@@ -19,20 +19,18 @@ from node.audit import NODE, Audit, Who
 from node.audit_routes import SCAN, AuditRoutes
 from node.auth import CHALLENGE, LOGIN, Auth, Refusal
 from node.axis_routes import AxisRoutes
-from node.bodies import CoarseQuery, ListedScan, NodeStatus, ScanDetail, SweepAsked
+from node.bodies import NodeStatus, SweepAsked
 from node.capture import Capture, CaptureStatus
 from node.config import Config
 from node.connection import Connection, House
 from node.derive import Derivation
 from node.durable import NoRoom
 from node.ending import AUDIT_BY_S, GOODBYES_BY_S, Ending
-from node.endpoints import is_scan, place_of, route
+from node.endpoints import place_of, route
 from node.exchange_routes import ExchangeRoutes
 from node.exhibits import Exhibits
-from node.first_view import scan_info
 from node.gate import Gate
 from node.health_routes import HealthRoutes
-from node.library import ScanSummary
 from node.library_routes import LibraryRoutes
 from node.live import Live
 from node.metrics import Metrics
@@ -40,9 +38,9 @@ from node.openapi import described
 from node.page import Page
 from node.pairing import PairingRoutes
 from node.proxy import believe
-from node.rest import harden, query_of, refusal, said
+from node.rest import harden, refusal, said
 from node.retention import delete, expired_in
-from node.scan_quality import told
+from node.scan_routes import ScanRoutes
 from node.sealed import HAS_DIED, has_died
 from node.shared import SharedFoveae
 from node.tls import Tls
@@ -117,12 +115,9 @@ class NodeServer:
             *Page().routes(),
             route("GET /openapi.json", self._describe),
             route("GET /v1/node", self._node),
-            route("GET /v1/scans", self._scans),
-            route("GET /v1/scans/{scan}", self._scan),
-            route("GET /v1/scans/{scan}/coarse", self._coarse),
-            route("GET /v1/scans/{scan}/picture", self._picture),
             route("POST /v1/sweeps", self._sweep),
             route("GET /v1/stream", self._stream),
+            *ScanRoutes(exhibits, self._shared).routes(),
             *self._shared.routes(),
             *LibraryRoutes(exhibits.library, capture, self._forget).routes(),
             *self.derivation.routes(),
@@ -311,36 +306,6 @@ class NodeServer:
         )  # fmt: skip
         return said(node)
 
-    async def _scans(self, request: web.Request) -> web.Response:
-        return said([_listed(scan) for scan in self._exhibits.library.scans()])
-
-    async def _scan(self, request: web.Request) -> web.Response:
-        scan, _ = await self._exhibits.open(request.match_info["scan"], "htj2k")
-        request[SCAN] = scan.id
-        quality = told(scan.about.quality) if scan.about.quality else None
-        known = structs.asdict(scan_info(scan))
-        return said(ScanDetail(**known, quality=quality, note=scan.about.note, made_from=scan.about.made_from))
-
-    async def _coarse(self, request: web.Request) -> web.Response:
-        """The first view as its two refinements, one behind the other, each behind its length (u32, little-endian)."""
-        codec = query_of(request, CoarseQuery).codec
-        scan, view = await self._exhibits.open(request.match_info["scan"], codec)
-        request[SCAN] = scan.id
-        body = b"".join(len(part).to_bytes(4, "little") + part for part in view.refinements(0))
-        headers = self._shared.cache_headers(request, scan)
-        return web.Response(body=body, content_type="application/octet-stream", headers=headers)
-
-    async def _picture(self, request: web.Request) -> web.Response:
-        """Nothing where there is no such scan: a page asks before it knows, and browsers complain of any failure."""
-        scan = request.match_info["scan"]
-        try:
-            request[SCAN], picture = await self._exhibits.picture(scan)
-        except LibraryError as error:
-            if has_died(error) or not is_scan(scan):
-                raise
-            return web.Response(status=204)
-        return web.Response(body=picture, content_type="image/webp")
-
     async def _sweep(self, request: web.Request) -> web.Response:
         if self._capture is None or not (number := self._capture.request_sweep()):
             raise web.HTTPConflict(text=self._capture_status().refusal or "the scanner was busy: try again")
@@ -377,14 +342,6 @@ class NodeServer:
 
     def _capture_status(self) -> CaptureStatus:
         return self._capture.status if self._capture else CaptureStatus("no scanner")
-
-
-def _listed(scan: ScanSummary) -> ListedScan:
-    s, about = scan.spec, scan.about
-    return ListedScan(
-        scan.id, about.created_unix_s, about.source, about.name, s.width, s.height, s.texture_width, s.texture_height,
-        s.geometry, about.made_from, scan.subject, scan.body_site,
-    )  # fmt: skip
 
 
 def _bound_buffers(transport: asyncio.Transport) -> None:

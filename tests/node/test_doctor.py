@@ -19,13 +19,14 @@ import pytest
 
 import foveascan
 from node import config as settings
-from node import doctor, library_folder, machine
+from node import doctor, library_folder, listener, machine
 from node.access import access_folder
 from node.audit import done_trail
 from node.doctor import Finding
 from node.durable import EASY_BYTES
 from node.identity import node_identity
 from node.library import About, Library
+from node.listener import who_answers
 from node.machine import Account
 from node.tls import renew_own
 from protocol.grid import Grid, GridSpec
@@ -192,13 +193,13 @@ def answering(body: bytes) -> Iterator[int]:
 def test_a_node_at_its_address_is_fine_another_program_is_not(body: bytes, state: str) -> None:
     with answering(body) as other:
         settled = server(other)
-        assert states(doctor.check_server(settled, doctor._who_answers(settled))) == [state]
+        assert states(doctor.check_server(settled, who_answers(settled))) == [state]
 
 
 def test_a_node_is_known_whether_it_serves_tls_or_not() -> None:
     with answering(b'{"status": "ready"}') as node:
         settled = settings.Server(listen=f"127.0.0.1:{node}")
-        assert doctor._who_answers(settled) == "node", "started with --insecure, of which the settings say nothing"
+        assert who_answers(settled) == "node", "started with --insecure, of which the settings say nothing"
 
 
 def test_a_node_with_another_library_is_not_the_one_that_is_meant(tmp_path: Path, port: str) -> None:
@@ -241,9 +242,9 @@ def test_where_locks_cannot_be_seen_a_node_is_believed(
 
 
 def test_a_program_that_says_nothing_is_another_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "ANSWER_S", 0.05)
+    monkeypatch.setattr(listener, "ANSWER_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        assert doctor._who_answers(server(silent.getsockname()[1])) == "other"
+        assert who_answers(server(silent.getsockname()[1])) == "other"
 
 
 def test_a_free_address_is_fine_one_that_is_not_ours_is_a_problem() -> None:
