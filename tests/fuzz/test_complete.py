@@ -36,7 +36,7 @@ NEEDS_NONE = {
     "node/advertise.py _interfaces": "the same",
     "node/advertise.py _own_addresses": "the same",
     "node/audit_command.py print_audit": "writes",
-    "node/doctor.py _answer": "whatever it raises means that it is no node",
+    "node/listener.py _answer": "whatever it raises means that it is no node",
     "node/endpoints.py is_scan": "a yes or no; the requests with it are fuzzed",
     "node/install.py _laid": "a list that root has written, and reads",
     "node/journal.py _meet": "names of files",
