@@ -100,13 +100,11 @@ def _mend(
     held = state.holdings.channels[Channel.RANGE]
     rank, level = (_of_region(array, region)[poor] for array in (held.rank, held.level))
     best = 65535 - int(rank.max())
-    if wanted.p > 1 and level.min() >= _level_at(wanted.p):
+    if wanted.p > 1 and best > 1 and level.min() >= _level_at(wanted.p):
         coded = _code_listed(scan, state, region, RangeParameters(wanted.p, best - 1, None), ~poor)
         if coded is not None and _cells_beyond(scan, coded, region, target_steps) <= allowed:
             return coded
-    quantum = min(2 * int(target_steps) + 1, best - 1)  # at spacing 1 no cell is off by more than half a quantum
-    if quantum < 1:
-        return None
+    quantum = max(min(2 * int(target_steps) + 1, best - 1), 1)  # at spacing 1 no cell is off by more than half of it
     return _code_listed(scan, state, region, RangeParameters(1, quantum, None), ~poor)
 
 

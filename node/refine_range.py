@@ -44,16 +44,18 @@ def choose_range(
     """The cheapest parameters whose error in the region is at most target_steps (99th percentile, "higher").
 
     trials : the trial of each spacing, None where it is impossible.   surely : a spacing that is known to do well; none
-    below it is tried.
+    below it is tried, unless it does not.
     """
     best, least_bytes = RangeParameters(p=1, quantum=1), math.inf
     for p in SPACINGS:
-        if p < surely:
+        if p < surely and math.isfinite(least_bytes):
             break
         trial = None if p > 1 and target_steps < 1 else trials(p)
         if trial is None or (p > 1 and trial.error(1) > target_steps):
             continue
         quantum = _largest_quantum(trial, p, target_steps)
+        if p > 1 and quantum == 1 and trial.checked() > target_steps:
+            continue
         size_bytes = trial.expected_bytes(quantum) * max(2 * target_steps / quantum, 1) ** FINENESS_COSTS
         if size_bytes >= least_bytes:
             break
@@ -192,8 +194,13 @@ class Trial:
         return self._errors[quantum]
 
     def assume(self, error: float) -> None:
-        """Quantum 1 leaves no more than this error: that is known, and not tried. [steps]"""
+        """Quantum 1 leaves about this error at most: that is known, and not tried. [steps]"""
         self._errors.setdefault(1, error)
+
+    def checked(self) -> float:
+        """What quantum 1 leaves, tried whatever was assumed. [steps]"""
+        self._errors.pop(1, None)
+        return self.error(1)
 
     def expected_bytes(self, quantum: int) -> float:
         """About how many bytes the refinement takes."""

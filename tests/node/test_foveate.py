@@ -113,6 +113,31 @@ def test_reaches_the_quality_asked_for(
     assert update.texture_db == pytest.approx(viewer.texture_db(look), abs=0.01)
 
 
+@pytest.mark.parametrize("hurried", [False, True])
+@pytest.mark.parametrize("range_mm", [0.02, 0.05])
+def test_a_model_that_promises_too_much_costs_tries_not_quality(
+    scan: Scan, view: FirstView, monkeypatch: pytest.MonkeyPatch, range_mm: float, hurried: bool
+) -> None:
+    look, told = Look(1, 0.3, 0.6, range_mm=range_mm), RangeModel(scan.spec, scan.range_steps, scan.filled)
+    known = plan_look(scan, view.state, look, range_model=told, hurried=hurried)
+    monkeypatch.setattr(RangeModel, "error", lambda self, region, p: 0.0 if p == 1 else 1.0)
+    viewer = Viewer(scan, view)
+    update = plan_look(scan, viewer.state, look, range_model=told, hurried=hurried)
+    viewer.take(update)
+    assert viewer.range_error_mm(look) <= range_mm
+    if not hurried:
+        assert update.wire_bytes <= 1.1 * known.wire_bytes
+
+
+def test_what_is_held_exactly_and_too_thinly_is_mended_by_what_is_dense(scan: Scan, view: FirstView) -> None:
+    viewer = Viewer(scan, view)
+    thin = LookParameters(range=RangeParameters(p=4, quantum=1))
+    viewer.take(plan_look(scan, viewer.state, Look(1, 0.3, 0.6, parameters=thin)))
+    look = Look(2, 0.3, 0.6, range_mm=0.05)
+    viewer.take(plan_look(scan, viewer.state, look))
+    assert viewer.range_error_mm(look) <= look.range_mm
+
+
 @pytest.mark.parametrize("known", [False, True])
 def test_everything_there_is_can_be_asked_for(
     scan: Scan, view: FirstView, model_of_texture: TextureModel, known: bool
