@@ -3,9 +3,13 @@ import type { Boot } from './link.ts';
 import { isCopy, showCopy } from './offline.ts';
 import { strings } from './strings.ts';
 import { h } from './ui/dom.ts';
+import { cardIsDone } from './view/compile.ts';
 import { rendererOf } from './view/renderer.ts';
 
-/** Build the page from what was begun already, in two tasks: together they would keep the page's thread too long. */
+/**
+ * Build the page from what was begun already, in two tasks: together they would keep its thread too long. Each asks the
+ * graphics card something, which answers only when it has done what it was given before.
+ */
 export async function main({ worker, said, canvas, context, poster, hire }: Boot): Promise<void> {
   const root = document.getElementById('app')!;
   if (!context) {
@@ -13,8 +17,9 @@ export async function main({ worker, said, canvas, context, poster, hire }: Boot
     root.replaceChildren(h('main', { class: 'sorry' }, h('p', {}, strings.noWebgl)));
     return;
   }
+  await cardIsDone(context);
   const renderer = rendererOf(canvas, context);
-  await new Promise((resolve) => setTimeout(resolve));
+  await cardIsDone(context);
   new App(root, worker, renderer, poster, hire);
   for (const event of said.splice(0)) worker.onmessage!(event);
 }

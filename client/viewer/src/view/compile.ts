@@ -6,8 +6,7 @@ import type { Camera, Object3D, WebGLRenderer } from 'three';
 const LOOK_MS = 4;
 
 /** Once the card has done all that it was told so far. */
-export async function cardIsDone(renderer: WebGLRenderer): Promise<void> {
-  const gl = renderer.getContext() as WebGL2RenderingContext;
+export async function cardIsDone(gl: WebGL2RenderingContext): Promise<void> {
   const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
   gl.flush();
   while (fence && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) {
@@ -22,9 +21,9 @@ export async function cardIsDone(renderer: WebGLRenderer): Promise<void> {
  */
 export async function compile(renderer: WebGLRenderer, object: Object3D, camera: Camera): Promise<void> {
   renderer.compile(object, camera);
-  const gl = renderer.getContext();
+  const gl = renderer.getContext() as WebGL2RenderingContext;
   while (!gl.isContextLost() && programsOf(renderer, object).some((program) => !program.isReady())) await aMoment();
-  await cardIsDone(renderer);
+  await cardIsDone(gl);
   for (const program of programsOf(renderer, object)) program.getUniforms();
 }
 

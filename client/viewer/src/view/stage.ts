@@ -262,7 +262,7 @@ export class Stage {
 
   /** Once all that was drawn is in the picture. */
   done(): Promise<void> {
-    return cardIsDone(this.renderer);
+    return cardIsDone(this.renderer.getContext() as WebGL2RenderingContext);
   }
 
   /** Do what the first picture could do without, so that the first look need not wait for it. */
