@@ -20,12 +20,21 @@ import tarfile
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 import msgspec
 
-from node.durable import decode_kept, disk_error, require_room, sync_folder, write_whole
+from node.durable import (
+    decode_kept,
+    disk_error,
+    give_to_owner_of,
+    make_private_folder,
+    require_room,
+    sync_folder,
+    write_whole,
+)
 from node.library_folder import CHECKED, RESTORE, move_in
 from node.scan_folder import (
     ARRAY_HEADER_BYTES_MAX,
@@ -77,7 +86,7 @@ class _Mark(msgspec.Struct, frozen=True):
 
 
 def backup(folder: Path, scan_ids: Iterable[str], path: Path) -> None:
-    """Write some scans of a library into a new file, which is whole or absent; needs no lock.
+    """Write some scans of a library into a new file, for its owner alone, which is whole or absent; needs no lock.
 
     Raises LibraryError when a scan is damaged or gone or the file exists or cannot be written.
     """
@@ -86,7 +95,7 @@ def backup(folder: Path, scan_ids: Iterable[str], path: Path) -> None:
     scan_ids = list(scan_ids)
     new = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(new, "xb") as file:
+        with open(new, "xb", opener=partial(os.open, mode=0o600)) as file:
             _pack(folder, scan_ids, file)
             file.flush()
             os.fsync(file.fileno())
@@ -107,6 +116,7 @@ def restore(path: Path, folder: Path) -> Restored:
         require_room(folder, os.fstat(file.fileno()).st_size, "restoring")
         staged = Path(tempfile.mkdtemp(prefix=RESTORE, dir=folder))
         try:
+            give_to_owner_of(folder, staged)
             scan_ids = _unpack(_TarReader(file), staged)
             for scan_id in scan_ids:
                 _check(staged / scan_id, "the backup is damaged")
@@ -216,7 +226,7 @@ def _unpack(reader: _TarReader, staged: Path) -> list[str]:
             raise LibraryError(f"not a sound backup: {name} is one too many")
         if scan_id not in scan_ids:
             scan_ids[scan_id] = None
-            (staged / scan_id).mkdir()
+            make_private_folder(staged / scan_id)
         sums[name] = _unpack_file(reader, staged / name, BYTES_MAX[file_name])
     expected = "".join(f"{digest}  {name}\n" for name, digest in sums.items()).encode()
     if reader.read_small(_SUMS_BYTES_MAX) != expected or len(scan_ids) != mark.scans:

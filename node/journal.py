@@ -25,7 +25,16 @@ from pathlib import Path
 
 from drivers.ledger import Ledger
 from node.background_writer import BackgroundWriter, append_whole
-from node.durable import NEW, disk_error, read_readable, read_through, require_room, sync_folder, write_whole
+from node.durable import (
+    NEW,
+    disk_error,
+    make_private_folder,
+    read_readable,
+    read_through,
+    require_room,
+    sync_folder,
+    write_whole,
+)
 from node.journal_records import (
     ENTRY_OVERHEAD,
     RECORD_OVERHEAD,
@@ -168,7 +177,7 @@ class Journals:
         self.problems: list[Problem] = []
         self._sweeps: dict[str, Interrupted] = {}
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_private_folder(folder)
             for name in sorted(os.listdir(folder)):
                 self._meet(folder / name)
         except OSError as error:

@@ -82,6 +82,27 @@ def test_a_backup_restored_is_the_same_library(saved: tuple[Path, Path], tmp_pat
     assert set(os.listdir(library.folder)) - OWN == set(restored.added)
 
 
+def test_nobody_else_reads_a_backup_what_was_restored_or_what_was_cut(saved: tuple[Path, Path], tmp_path: Path) -> None:
+    source, _ = saved
+    before = os.umask(0o022)
+    try:
+        backup(source, survey(source)[0], tmp_path / "mine.tar")
+        library = Library(tmp_path / "library")
+        restored = library.restore(tmp_path / "mine.tar")
+    finally:
+        os.umask(before)
+    private = [tmp_path / "mine.tar", library.folder / "sweeps", *(library.folder / scan for scan in restored.added)]
+    assert len(private) > 3 and [oct(path.stat().st_mode & 0o077) for path in private] == ["0o0"] * len(private)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_what_root_restores_belongs_to_the_account_of_the_library(saved: tuple[Path, Path], tmp_path: Path) -> None:
+    os.chown(tmp_path, 4711, 4712)
+    library = Library(tmp_path)
+    folders = [tmp_path / "sweeps", *(tmp_path / scan for scan in library.restore(saved[1]).added)]
+    assert {(path.stat().st_uid, path.stat().st_gid) for path in folders} == {(4711, 4712)}
+
+
 def test_tar_and_sha256sum_understand_a_backup(saved: tuple[Path, Path], tmp_path: Path) -> None:
     subprocess.run(["tar", "xf", saved[1]], cwd=tmp_path, check=True)
     subprocess.run(["sha256sum", "-c", "--quiet", "--strict", "SHA256SUMS"], cwd=tmp_path, check=True)
