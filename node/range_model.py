@@ -73,8 +73,8 @@ class RangeModel:
     def error(self, region: Region, p: int) -> float:
         """99th percentile of the error over a region's measured cells, 5% too high at most; infinite where unknown.
 
-        Cells are weighed by their area. Of many a ninth is looked at, which is off by some percent more: what is
-        planned by it is tried, or checked.
+        Cells are weighed by their area. Of many a ninth is looked at: off by some percent more, and by a factor of two
+        where a few cells on an edge decide. What is planned by it is tried, or checked.
         """
         if p == 1 or p not in self._strides:
             return 0.0 if p == 1 else np.inf
